@@ -1,0 +1,119 @@
+"""Nearest neighbours without an N x N argsort, and gathering by index."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["gather_vertices", "knn"]
+
+_TILE_ELEMENTS = 1 << 22  # distances held at once by the tiled search: 16 MiB in float32
+
+
+def knn(
+    points: Tensor,
+    k: int,
+    *,
+    query: Tensor | None = None,
+    mask: Tensor | None = None,
+    method: str = "auto",
+) -> Tensor:
+    r"""Indices of the ``k`` nearest points of each query, nearest first.
+
+    .. math:: \mathrm{knn}(q) = \operatorname{arg\,min}^{k}_{j} \lVert q - p_j \rVert_2
+
+    A query that is itself one of the points has itself as first neighbour (up to ties between coincident points).
+    The search carries no gradient.
+
+    Args:
+        points: ``(B, N, 3)`` (or any number of coordinates).
+        k: number of neighbours, at most the smallest number of real points in the batch.
+        query: ``(B, Q, 3)``; the points themselves when ``None``.
+        mask: ``(B, N)`` bool, True = real point. Padded points are never returned. Rows of padded queries hold valid
+            but meaningless indices.
+        method: ``"tree"`` (SciPy's KD-tree, CPU), ``"tiles"`` (blocks of the distance matrix, any device) or
+            ``"auto"``: the tree on the CPU, tiles elsewhere.
+
+    Returns:
+        ``(B, Q, k)`` int64.
+
+    Raises:
+        ValueError: shapes do not fit, ``k`` is not positive, or a sample has fewer than ``k`` real points.
+
+    Example:
+        >>> line = torch.arange(5.0)[None, :, None]
+        >>> knn(line, 2)[0, 0].tolist()
+        [0, 1]
+    """
+    if points.dim() != 3:
+        raise ValueError(f"points must have shape (B, N, C), got {tuple(points.shape)}")
+    if query is not None and (query.dim() != 3 or query.shape[::2] != points.shape[::2]):
+        raise ValueError(f"query must have shape (B, Q, C) like points {tuple(points.shape)}, got {tuple(query.shape)}")
+    if method not in ("auto", "tree", "tiles"):
+        raise ValueError(f'method must be "auto", "tree" or "tiles", got {method!r}')
+    fewest = points.shape[1] if mask is None else int(mask.sum(1).min()) if len(mask) else 0
+    if not 1 <= k <= fewest:
+        raise ValueError(
+            f"k={k} neighbours were asked for, but the smallest mesh of the batch has {fewest} vertices: "
+            "use a smaller k or a larger mesh"
+        )
+    points = points.detach()
+    query = points if query is None else query.detach()
+    if method == "auto":
+        method = "tree" if points.device.type == "cpu" else "tiles"
+    search = _knn_tree if method == "tree" else _knn_tiles
+    return search(points, query, k, mask)
+
+
+def _knn_tree(points: Tensor, query: Tensor, k: int, mask: Tensor | None) -> Tensor:
+    import numpy as np
+    from scipy.spatial import cKDTree
+
+    rows = []
+    for b in range(len(points)):
+        real = None if mask is None else mask[b].nonzero()[:, 0].cpu()
+        cloud = points[b].double().cpu() if real is None else points[b].double().cpu()[real]
+        # A NaN would make the tree raise from inside SciPy; far away it simply is nobody's neighbour.
+        cloud = torch.nan_to_num(cloud, nan=1e30, posinf=1e30, neginf=-1e30)
+        asked = torch.nan_to_num(query[b].double().cpu(), nan=1e30, posinf=1e30, neginf=-1e30)
+        index = cKDTree(cloud.numpy()).query(asked.numpy(), k=range(1, k + 1))[1]
+        index = torch.from_numpy(np.ascontiguousarray(index, dtype=np.int64))
+        rows.append(index if real is None else real[index])
+    return torch.stack(rows).to(points.device)
+
+
+def _knn_tiles(points: Tensor, query: Tensor, k: int, mask: Tensor | None) -> Tensor:
+    batch, num = points.shape[:2]
+    step = max(1, _TILE_ELEMENTS // (batch * num))
+    rows = []
+    for start in range(0, query.shape[1], step):
+        # The direct form keeps tiny distances exact, where |a|^2 - 2ab + |b|^2 would lose them.
+        tile = torch.cdist(query[:, start : start + step], points, compute_mode="donot_use_mm_for_euclid_dist")
+        if mask is not None:
+            tile = tile.masked_fill(~mask[:, None], torch.inf)
+        rows.append(tile.topk(k, dim=2, largest=False).indices)
+    return torch.cat(rows, 1)
+
+
+def gather_vertices(x: Tensor, index: Tensor) -> Tensor:
+    """Rows of ``x`` picked per sample: ``out[b, ...] = x[b, index[b, ...]]``.
+
+    Args:
+        x: ``(B, N, C)``.
+        index: ``(B, ...)`` int64 with values in ``[0, N)``.
+
+    Returns:
+        ``(B, ..., C)``.
+
+    Raises:
+        ValueError: batch sizes differ.
+
+    Example:
+        >>> gather_vertices(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[1, 1, 0]]))[0, :, 0].tolist()
+        [2.0, 2.0, 1.0]
+    """
+    if x.dim() != 3 or len(index) != len(x):
+        raise ValueError(f"x must be (B, N, C) and index (B, ...), got {tuple(x.shape)} and {tuple(index.shape)}")
+    batch, num, channels = x.shape
+    offset = torch.arange(batch, device=x.device).mul_(num).view(-1, *[1] * (index.dim() - 1))
+    return x.reshape(-1, channels).index_select(0, (index + offset).reshape(-1)).view(*index.shape, channels)
