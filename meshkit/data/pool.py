@@ -1,0 +1,105 @@
+"""A pool of posed meshes with their descriptors, computed once and sampled from during training."""
+
+from __future__ import annotations
+
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from meshkit.data.rigged import RiggedModel
+from meshkit.descriptors import wave_kernel_signature
+
+__all__ = ["MeshPool"]
+
+
+@dataclass(frozen=True)
+class MeshPool:
+    """Posed meshes of known identity and pose, with per-vertex descriptors of the posed surface.
+
+    Descriptors are computed from the very meshes a network is given, never from a rest shape that a user would not
+    have.
+
+    Args:
+        identity: ``(P,)`` index of the identity of each mesh.
+        pose: ``(P,)`` index of its pose.
+        verts: ``(P, V, 3)``.
+        descriptors: ``(P, V, D)``.
+    """
+
+    identity: Tensor
+    pose: Tensor
+    verts: Tensor
+    descriptors: Tensor
+
+    def __len__(self) -> int:
+        return len(self.identity)
+
+    @classmethod
+    def build(
+        cls,
+        model: RiggedModel,
+        identities: Tensor,
+        poses: Tensor,
+        size: int,
+        *,
+        num_signatures: int = 16,
+        num_eigenpairs: int = 64,
+        seed: int = 0,
+        workers: int = 1,
+        progress: bool = False,
+    ) -> MeshPool:
+        """Draw ``size`` (identity, pose) combinations and compute their wave-kernel signatures.
+
+        Args:
+            model: body with tables of identities and poses.
+            identities: allowed identity indices.
+            poses: allowed pose indices.
+            size: number of meshes.
+            num_signatures: see :func:`~meshkit.descriptors.wave_kernel_signature`.
+            num_eigenpairs: likewise.
+            seed: of the draw.
+            workers: processes; the eigensolver uses one core each. With more than one, a script must keep its work
+                under ``if __name__ == "__main__"``, as for any spawned process.
+            progress: show a progress bar.
+
+        Raises:
+            ValueError: ``size`` is smaller than 2.
+        """
+        from tqdm import tqdm
+
+        if size < 2:
+            raise ValueError(f"a pool needs at least 2 meshes to make a pair, got {size}")
+        generator = torch.Generator().manual_seed(seed)
+        identity = identities[torch.randint(len(identities), (size,), generator=generator)]
+        pose = poses[torch.randint(len(poses), (size,), generator=generator)]
+        with torch.no_grad():
+            verts = torch.cat([model(i, p) for i, p in zip(identity.split(64), pose.split(64), strict=True)])
+        compute = partial(_signature, faces=model.faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs)
+        # Spawned processes do not inherit the threads of this one, which forked ones would find half alive.
+        context = multiprocessing.get_context("spawn")
+        bar = partial(tqdm, total=size, desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True)
+        if workers <= 1:
+            signatures = list(bar(map(compute, verts)))
+        else:
+            with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as executor:
+                signatures = list(bar(executor.map(compute, [v.numpy() for v in verts], chunksize=8)))
+        return cls(identity, pose, verts, torch.stack([torch.as_tensor(s) for s in signatures]))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The four tensors, to be saved."""
+        return {name: getattr(self, name).contiguous() for name in self.__dataclass_fields__}
+
+
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def _signature(verts: object, *, faces: Tensor, num_signatures: int, num_eigenpairs: int) -> object:
+    points = torch.as_tensor(verts)
+    result = wave_kernel_signature(points, faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs)
+    # NumPy arrays cross process borders by value; tensors would go through shared memory handles.
+    return result.numpy()

@@ -1,0 +1,221 @@
+"""Linear-blend skinning of a rigged body with shape directions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["RiggedModel", "rotation_matrices"]
+
+
+def rotation_matrices(rotation_vectors: Tensor) -> Tensor:
+    r"""Rotation matrices of rotation vectors (axis times angle in radians), by Rodrigues' formula.
+
+    .. math:: R = I + \frac{\sin\theta}{\theta} [r]_\times + \frac{1 - \cos\theta}{\theta^2} [r]_\times^2,
+              \qquad \theta = \lVert r \rVert
+
+    Smooth at zero: both quotients are evaluated through sinc.
+
+    Args:
+        rotation_vectors: ``(..., 3)``.
+
+    Returns:
+        ``(..., 3, 3)``.
+
+    Example:
+        >>> rotation_matrices(torch.tensor([0.0, 0.0, torch.pi / 2])).round().int().tolist()
+        [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    """
+    squared = rotation_vectors.square().sum(-1)[..., None, None]
+    small = squared < 1e-12
+    angle = torch.where(small, 1.0, squared).sqrt()
+    sine = torch.where(small, 1 - squared / 6, torch.sin(angle) / angle)
+    half = torch.sin(angle / 2) / angle
+    cosine = torch.where(small, 0.5 - squared / 24, 2 * half.square())
+    x, y, z = rotation_vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    identity = torch.eye(3, dtype=cross.dtype, device=cross.device)
+    return identity + sine * cross + cosine * (cross @ cross)
+
+
+class RiggedModel(nn.Module):
+    r"""A body with shape directions, a skeleton and skinning weights.
+
+    Shape: :math:`v = \bar v + \sum_k \beta_k S_k`, joints alike. Forward kinematics with local rotations :math:`R_j`
+    about the rest joints :math:`J_j`, root first:
+
+    .. math:: G_j = G_{p(j)} R_j, \qquad q_j = q_{p(j)} + G_{p(j)} (J_j - J_{p(j)}), \qquad
+              v' = \sum_j w_j \bigl(G_j (v - J_j) + q_j\bigr)
+
+    Local rotations are expressed in axes aligned with the world at rest, so one set of rotations is the same pose on
+    every identity. Everything is a buffer: ``.to(device)`` moves it, and gradients flow to shape and pose.
+
+    Args:
+        template: ``(V, 3)`` mean shape.
+        faces: ``(F, 3)`` int64.
+        shape_dirs: ``(K, V, 3)`` shape directions.
+        joints: ``(J, 3)`` rest joints of the mean shape.
+        joint_dirs: ``(K, J, 3)`` how joints follow the shape.
+        weights: ``(V, J)`` skinning weights; normalised to sum to 1 per vertex.
+        parents: ``(J,)`` parent of each joint, -1 for the root, which is joint 0; parents come before children.
+        pose_correctives: ``(9 (J - 1), V, 3)`` linear offsets in the entries of ``R_j - I`` of all joints but the
+            root (SMPL's pose blend shapes), or ``None``.
+        identities: ``(I, K)`` a table of known identities, for use by index.
+        poses: ``(P, J, 3)`` a table of known poses as rotation vectors, for use by index.
+
+    Raises:
+        ValueError: shapes disagree, or a parent does not precede its child.
+
+    Example:
+        >>> from meshkit.data import load_humans
+        >>> body = load_humans(1000)
+        >>> body(torch.tensor([3, 4]), torch.tensor([10, 10])).shape
+        torch.Size([2, 1000, 3])
+        >>> body(torch.zeros(1, 40), torch.zeros(1, 74, 3)).allclose(body.template, atol=1e-6)
+        True
+    """
+
+    template: Tensor
+    faces: Tensor
+    shape_dirs: Tensor
+    joints: Tensor
+    joint_dirs: Tensor
+    weights: Tensor
+    parents: Tensor
+    pose_correctives: Tensor | None
+    identities: Tensor | None
+    poses: Tensor | None
+
+    def __init__(
+        self,
+        template: Tensor,
+        faces: Tensor,
+        shape_dirs: Tensor,
+        joints: Tensor,
+        joint_dirs: Tensor,
+        weights: Tensor,
+        parents: Tensor,
+        *,
+        pose_correctives: Tensor | None = None,
+        identities: Tensor | None = None,
+        poses: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        num_verts, num_joints, num_shapes = len(template), len(joints), len(shape_dirs)
+        expected = {
+            "template": (template, (num_verts, 3)),
+            "faces": (faces, (len(faces), 3)),
+            "shape_dirs": (shape_dirs, (num_shapes, num_verts, 3)),
+            "joints": (joints, (num_joints, 3)),
+            "joint_dirs": (joint_dirs, (num_shapes, num_joints, 3)),
+            "weights": (weights, (num_verts, num_joints)),
+            "parents": (parents, (num_joints,)),
+            "pose_correctives": (pose_correctives, (9 * (num_joints - 1), num_verts, 3)),
+            "identities": (identities, (0 if identities is None else len(identities), num_shapes)),
+            "poses": (poses, (0 if poses is None else len(poses), num_joints, 3)),
+        }
+        for name, (value, shape) in expected.items():
+            if value is not None and value.shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
+            self.register_buffer(name, value, persistent=False)
+        if (
+            parents[0] != -1
+            or bool((parents[1:] >= torch.arange(1, num_joints)).any())
+            or bool((parents[1:] < 0).any())
+        ):
+            raise ValueError("joint 0 must be the root (parent -1) and every other joint must come after its parent")
+        self.weights = weights / weights.sum(1, keepdim=True)
+        self._levels = _levels(parents.tolist())
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints J."""
+        return len(self.joints)
+
+    def shape(self, identity: Tensor) -> tuple[Tensor, Tensor]:
+        """Rest vertices ``(B, V, 3)`` and joints ``(B, J, 3)`` of identities, by index or coefficients."""
+        betas = self._betas(identity)
+        verts = self.template + torch.einsum("bk,kvc->bvc", betas, self.shape_dirs)
+        joints = self.joints + torch.einsum("bk,kjc->bjc", betas, self.joint_dirs)
+        return verts, joints
+
+    def forward(self, identity: Tensor, pose: Tensor) -> Tensor:
+        """Posed vertices.
+
+        Args:
+            identity: ``(B,)`` integers, indices into ``identities``, or ``(B, K)`` shape coefficients.
+            pose: ``(B,)`` integers, indices into ``poses``; ``(B, J, 3)`` rotation vectors in radians; or
+                ``(B, J, 3, 3)`` rotation matrices.
+
+        Returns:
+            ``(B, V, 3)``.
+
+        Raises:
+            ValueError: indices without a table or out of its range, shapes that do not fit, batches that differ.
+        """
+        verts, joints = self.shape(identity)
+        rotations = self._rotations(pose)
+        if len(rotations) != len(verts):
+            raise ValueError(f"identity and pose batches differ: {len(verts)} and {len(rotations)}")
+        if self.pose_correctives is not None:
+            bend = (rotations[:, 1:] - torch.eye(3).to(rotations)).flatten(1)
+            verts = verts + torch.einsum("bp,pvc->bvc", bend, self.pose_correctives)
+        globals_, positions = self._kinematics(rotations, joints)
+        shift = positions - (globals_ @ joints[..., None])[..., 0]
+        transforms = torch.cat([globals_, shift[..., None]], -1).flatten(2)
+        blended = (self.weights @ transforms).unflatten(-1, (3, 4))
+        return (blended[..., :3] @ verts[..., None])[..., 0] + blended[..., 3]
+
+    def _kinematics(self, rotations: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
+        """Global rotations and positions, one batched product per level of the skeleton."""
+        globals_: list[Tensor] = [rotations[:, :1]]
+        positions: list[Tensor] = [joints[:, :1]]
+        for level, parent_slots, parents in self._levels[0]:
+            parent_rotation = globals_[-1][:, parent_slots]
+            bone = joints[:, level] - joints[:, parents]
+            globals_.append(parent_rotation @ rotations[:, level])
+            positions.append(positions[-1][:, parent_slots] + (parent_rotation @ bone[..., None])[..., 0])
+        return torch.cat(globals_, 1)[:, self._levels[1]], torch.cat(positions, 1)[:, self._levels[1]]
+
+    def _betas(self, identity: Tensor) -> Tensor:
+        if identity.is_floating_point():
+            if identity.dim() != 2 or identity.shape[1] != len(self.shape_dirs):
+                raise ValueError(f"coefficients must be (B, {len(self.shape_dirs)}), got {tuple(identity.shape)}")
+            return identity
+        return _rows(self.identities, identity, "identity")
+
+    def _rotations(self, pose: Tensor) -> Tensor:
+        if not pose.is_floating_point():
+            return rotation_matrices(_rows(self.poses, pose, "pose"))
+        if pose.dim() == 3 and pose.shape[1:] == (self.num_joints, 3):
+            return rotation_matrices(pose)
+        if pose.dim() == 4 and pose.shape[1:] == (self.num_joints, 3, 3):
+            return pose
+        raise ValueError(
+            f"pose must be (B,) integers, (B, {self.num_joints}, 3) rotation vectors or (B, {self.num_joints}, 3, 3) "
+            f"matrices, got {tuple(pose.shape)}"
+        )
+
+
+def _rows(table: Tensor | None, index: Tensor, what: str) -> Tensor:
+    if table is None:
+        raise ValueError(f"this model has no table of {what} entries: give coefficients instead of indices")
+    if index.dim() != 1 or (len(index) and not 0 <= int(index.min()) <= int(index.max()) < len(table)):
+        raise ValueError(f"{what} indices must be a vector of values in [0, {len(table)}), got {index.tolist()}")
+    return table[index]
+
+
+def _levels(parents: list[int]) -> tuple[list[tuple[list[int], list[int], list[int]]], list[int]]:
+    """Joints by depth, each level with its parents' slots in the level above; and the order that undoes it."""
+    depth = [0] * len(parents)
+    for joint, parent in enumerate(parents[1:], 1):
+        depth[joint] = depth[parent] + 1
+    levels, order, previous = [], [0], [0]
+    for d in range(1, max(depth) + 1):
+        level = [j for j in range(len(parents)) if depth[j] == d]
+        above = [parents[j] for j in level]
+        levels.append((level, [previous.index(p) for p in above], above))
+        order += level
+        previous = level
+    return levels, [order.index(j) for j in range(len(parents))]
