@@ -1,0 +1,16 @@
+"""Deformation of meshes: as-rigid-as-possible, with gradients."""
+
+from meshkit.deform.arap import ARAPInfo, arap_deform, arap_energy
+from meshkit.deform.deformer import ARAPDeformer
+from meshkit.deform.rotation import closest_rotation
+from meshkit.topology import cotangent_laplacian, mass_matrix
+
+__all__ = [
+    "ARAPDeformer",
+    "ARAPInfo",
+    "arap_deform",
+    "arap_energy",
+    "closest_rotation",
+    "cotangent_laplacian",
+    "mass_matrix",
+]
