@@ -68,7 +68,7 @@ class PoseTransferStack(nn.Module):
         weight = self.mix.weight @ self.lift.weight
         x = nn.functional.linear(warped, weight, self.mix(self.lift.bias))
         for block, narrow in zip(self.blocks, self.narrow, strict=True):
-            x = narrow(block(x, features, mask=mask))
+            x = block(x, features, mask=mask, then=narrow)
         x = 2 * torch.tanh(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x)
         return x + warped if self.residual else x
 

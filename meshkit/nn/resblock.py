@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor, nn
+from torch.nn.functional import leaky_relu, linear
 from torch.nn.utils.parametrizations import spectral_norm
 
 from meshkit.norm import ElaIN
@@ -56,15 +57,23 @@ class ConditionalResBlock(nn.Module):
         self.conv_1 = wrap(nn.Linear(num_features, num_features))
         self.conv_s = wrap(nn.Linear(num_features, num_features, bias=False))
 
-    def forward(self, x: Tensor, cond: Tensor, *, mask: Tensor | None = None) -> Tensor:
-        """Transform ``x`` under ``cond``."""
+    def forward(self, x: Tensor, cond: Tensor, *, mask: Tensor | None = None, then: nn.Linear | None = None) -> Tensor:
+        """Transform ``x`` under ``cond``, and apply the linear map ``then`` to the result.
+
+        ``then`` is composed with the last maps of both branches, since no activation lies between: where it narrows,
+        the two C x C products per vertex shrink to its width.
+        """
         shared: dict[str, Any] = {}
         statistics: Callable[..., Any] | None = getattr(self.norm_0, "statistics", None)
         if statistics is not None:
             shared["statistics"] = statistics(x, mask=mask)
         residual = self.conv_0(self._act(self.norm_0(x, cond, mask=mask, **shared)))
-        residual = self.conv_1(self._act(self.norm_1(residual, cond, mask=mask)))
-        return self.conv_s(self._act(self.norm_s(x, cond, mask=mask, **shared))) + residual
+        residual = self._act(self.norm_1(residual, cond, mask=mask))
+        shortcut = self._act(self.norm_s(x, cond, mask=mask, **shared))
+        if then is None:
+            return self.conv_s(shortcut) + self.conv_1(residual)
+        weight, bias = then.weight @ self.conv_1.weight, then(self.conv_1.bias)
+        return linear(shortcut, then.weight @ self.conv_s.weight) + linear(residual, weight, bias)
 
     def _act(self, x: Tensor) -> Tensor:
-        return nn.functional.leaky_relu(x, self.slope)
+        return leaky_relu(x, self.slope)
