@@ -7,7 +7,7 @@ from torch import Tensor
 
 from meshkit.topology import cotangent_laplacian, mass_matrix
 
-__all__ = ["laplacian_eigenpairs", "wave_kernel_signature"]
+__all__ = ["intrinsic_descriptors", "laplacian_eigenpairs", "wave_kernel_signature"]
 
 # A Laplacian scaled to unit area has its first eigenvalues near 10. A shift well below that keeps the factorised
 # matrix definite and far from singular, and still orders the spectrum from its low end.
@@ -75,6 +75,43 @@ def laplacian_eigenpairs(verts: Tensor, faces: Tensor, k: int = 64, *, tol: floa
         torch.from_numpy(eigenvalues[order].clip(min=0.0)).to(verts),
         torch.from_numpy(np.ascontiguousarray(vectors)).to(verts),
     )
+
+
+def intrinsic_descriptors(
+    verts: Tensor, faces: Tensor, *, num_signatures: int = 16, num_eigenpairs: int = 64, mask: Tensor | None = None
+) -> Tensor:
+    r"""Wave-kernel signatures, and the size of the mesh, which they leave out: :math:`\log \sqrt{\mathrm{area}}`.
+
+    Nothing in them depends on the pose, as far as posing keeps lengths. So they say where on a body a vertex is and
+    what body it is, and cannot say how the body stands.
+
+    Args:
+        verts: ``(V, 3)``, or a batch ``(B, V, 3)``.
+        faces: ``(F, 3)`` int64, or per mesh ``(B, F, 3)`` padded with -1.
+        num_signatures: see :func:`wave_kernel_signature`.
+        num_eigenpairs: likewise.
+        mask: ``(B, V)`` bool, True = real vertex; padded rows come out as 0.
+
+    Returns:
+        ``(V, num_signatures + 1)`` or ``(B, V, num_signatures + 1)``, without gradient, not standardised.
+
+    Raises:
+        ValueError: as :func:`wave_kernel_signature`.
+
+    Example:
+        >>> verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+        >>> intrinsic_descriptors(verts, faces, num_signatures=3).shape
+        torch.Size([4, 4])
+    """
+    signature = wave_kernel_signature(
+        verts, faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs, mask=mask
+    )
+    area = mass_matrix(verts.detach(), faces, kind="barycentric").sum(-1, keepdim=True)[..., None]
+    size = area.sqrt().log().expand(*signature.shape[:-1], 1)
+    if mask is not None:
+        size = size.masked_fill(~mask[..., None], 0.0)
+    return torch.cat([signature, size], -1)
 
 
 def wave_kernel_signature(

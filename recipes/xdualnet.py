@@ -25,11 +25,11 @@ from lightning_fabric import Fabric
 from torch import Tensor
 from tqdm import tqdm
 
-from meshkit.batching import center
+from meshkit.batching import bounding_box_center, center
 from meshkit.consistency import DualReconstruction
 from meshkit.data import MeshPool, PairBatch, PairSampler, PosePairs, human_split, load_humans, pair_loader
 from meshkit.deform import ARAPDeformer
-from meshkit.descriptors import wave_kernel_signature
+from meshkit.descriptors import intrinsic_descriptors
 from meshkit.io import MeshFileError, load_mesh, save_mesh
 from meshkit.losses import (
     backward_correspondence_loss,
@@ -39,6 +39,7 @@ from meshkit.losses import (
 )
 from meshkit.metrics import chamfer_distance, correspondence_error, pmd
 from meshkit.models import GeneratorConfig, PoseTransferGenerator, load_generator
+from meshkit.models.presets import PRESETS as MODELS
 from meshkit.viz import contact_sheet, error_colors, plot_curves, render
 
 
@@ -129,12 +130,11 @@ class Config:
 
 
 PRESETS = {
-    "tiny": Config(
-        model=GeneratorConfig(extractor_widths=(16, 32, 32), k=8, widths=(256, 128, 64), descriptors="wks"),
-    ),
+    "tiny": Config(model=MODELS["tiny"], lr=2e-3, lambda_edge=40.0),
     "paper": Config(
         preset="paper",
         name="xdualnet-paper",
+        model=MODELS["paper"],
         minutes=None,
         steps=200 * 1600,
         resample=False,
@@ -266,7 +266,7 @@ def data(cfg: Config, run: Run, workers: int) -> tuple[PosePairs, PosePairs]:
                     identities,
                     poses,
                     size,
-                    num_signatures=cfg.model.descriptor_channels,
+                    num_signatures=cfg.model.num_signatures,
                     seed=seed,
                     workers=workers,
                     progress=True,
@@ -329,17 +329,17 @@ def train(cfg: Config) -> None:
     run.save_json("config.json", json.loads(json.dumps(asdict(cfg), default=str)))
     run.save_json("model.json", asdict(cfg.model))
 
-    first, seconds = 0, 0.0
+    first, seconds, waiting = 0, 0.0, 0.0
     state = run.load_state() if cfg.resume else None
     if state is not None:
         generator.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
-        first, seconds = state["step"], state["seconds"]
+        first, seconds, waiting = state["step"], state["seconds"], state["waiting"]
         run.cut_log(first)
     else:
         run.cut_log(-1)
 
-    waiting, clock = 0.0, time.perf_counter()
+    clock = time.perf_counter()
     bar = tqdm(total=steps, initial=first, unit="step", dynamic_ncols=True, smoothing=0.05)
     batches = iter(loader(first, steps))
     for s in range(first, steps):
@@ -356,7 +356,7 @@ def train(cfg: Config) -> None:
             bar.write(f"step {s + 1}: PMD {record['eval']['pmd']:.2f}e-3 on 24 unseen pairs")
         run.log(**record)
         if (s + 1) % cfg.save_every == 0 or s + 1 == steps:
-            run.save_state(generator, optimizer, s + 1, {"seconds": seconds})
+            run.save_state(generator, optimizer, s + 1, {"seconds": seconds, "waiting": waiting})
         clock = time.perf_counter()
     bar.close()
     report(cfg, run, generator, test_pairs, fabric.device, seconds, waiting)
@@ -472,7 +472,7 @@ def apply(cfg: Config) -> None:
         generator, model = load_generator(cfg.out / cfg.name)
         meshes = [load_mesh(path) for path in cfg.apply]
         signatures = [
-            wave_kernel_signature(verts, faces, num_signatures=model.descriptor_channels)[None]
+            intrinsic_descriptors(verts, faces, num_signatures=model.num_signatures)[None]
             if model.descriptors == "wks"
             else None
             for verts, faces in meshes
@@ -484,7 +484,8 @@ def apply(cfg: Config) -> None:
             identity_descriptors=signatures[0],
             pose_descriptors=signatures[1],
         )
-        save_mesh(cfg.result, output.vertices[0], faces)
+        # Training meshes are centred; the result goes to where the pose mesh stands.
+        save_mesh(cfg.result, output.vertices[0] + bounding_box_center(pose[None])[0], faces)
     except (MeshFileError, ValueError) as error:
         raise UserError(str(error)) from None
     except OSError as error:

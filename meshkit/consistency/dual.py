@@ -148,9 +148,8 @@ class DualReconstruction(nn.Module):
 
     def _generate(self, identity: _Mesh, pose: _Mesh) -> Any:
         arguments = {"identity_mask": identity.mask, "pose_mask": pose.mask}
-        if identity.features is None:
-            arguments |= {"identity_descriptors": identity.descriptors, "pose_descriptors": pose.descriptors}
-        else:
+        arguments |= {"identity_descriptors": identity.descriptors, "pose_descriptors": pose.descriptors}
+        if identity.features is not None:
             arguments |= {"identity_features": identity.features, "pose_features": pose.features}
         result = self.generator(identity.verts, pose.verts, **arguments)
         return _Vertices(result) if isinstance(result, Tensor) else result
@@ -180,4 +179,5 @@ class _Mesh(NamedTuple):
     def subset(self, index: Tensor | None) -> _Mesh:
         if index is None or self.features is None:
             return self
-        return _Mesh(gather_vertices(self.verts, index), None, None, gather_vertices(self.features, index))
+        descriptors = None if self.descriptors is None else gather_vertices(self.descriptors, index)
+        return _Mesh(gather_vertices(self.verts, index), None, descriptors, gather_vertices(self.features, index))

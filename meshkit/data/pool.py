@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from meshkit.data.rigged import RiggedModel
-from meshkit.descriptors import wave_kernel_signature
+from meshkit.descriptors import intrinsic_descriptors
 
 __all__ = ["MeshPool"]
 
@@ -52,14 +52,14 @@ class MeshPool:
         workers: int = 1,
         progress: bool = False,
     ) -> MeshPool:
-        """Draw ``size`` (identity, pose) combinations and compute their wave-kernel signatures.
+        """Draw ``size`` (identity, pose) combinations and compute their intrinsic descriptors.
 
         Args:
             model: body with tables of identities and poses.
             identities: allowed identity indices.
             poses: allowed pose indices.
             size: number of meshes.
-            num_signatures: see :func:`~meshkit.descriptors.wave_kernel_signature`.
+            num_signatures: see :func:`~meshkit.descriptors.intrinsic_descriptors`.
             num_eigenpairs: likewise.
             seed: of the draw.
             workers: processes; the eigensolver uses one core each. With more than one, a script must keep its work
@@ -100,6 +100,6 @@ def _one_thread() -> None:
 
 def _signature(verts: object, *, faces: Tensor, num_signatures: int, num_eigenpairs: int) -> object:
     points = torch.as_tensor(verts)
-    result = wave_kernel_signature(points, faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs)
+    result = intrinsic_descriptors(points, faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs)
     # NumPy arrays cross process borders by value; tensors would go through shared memory handles.
     return result.numpy()

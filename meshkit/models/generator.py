@@ -86,6 +86,10 @@ class PoseTransferGenerator(nn.Module):
         k: neighbours in the extractor.
         descriptors: descriptor channels per vertex beside the coordinates (0: coordinates alone, as in the paper).
         widths: channels of the residual blocks.
+        condition: what the residual blocks know of the identity. ``"features"``: the extractor's features, as in the
+            paper. ``"descriptors"``: the descriptors alone, which do not change with the pose. Features contain the
+            identity mesh's coordinates and with them its own pose; where that pose is the wanted one, as when dual
+            reconstruction rebuilds B from B, the blocks can copy it, and never learn to transfer a shape.
         eps: entropic regularisation of the matching.
         n_iters: Sinkhorn iterations.
         spectral: spectral normalisation in the blocks.
@@ -120,12 +124,18 @@ class PoseTransferGenerator(nn.Module):
         n_iters: int = 5,
         spectral: bool = True,
         residual: bool = False,
+        condition: str = "features",
         normalize_plan: bool = True,
     ) -> None:
         super().__init__()
-        self.eps, self.n_iters, self.normalize_plan = eps, n_iters, normalize_plan
+        if condition not in ("features", "descriptors"):
+            raise ValueError(f'condition must be "features" or "descriptors", got {condition!r}')
+        if condition == "descriptors" and descriptors == 0:
+            raise ValueError('condition="descriptors" needs descriptors: give their number of channels')
+        self.eps, self.n_iters, self.normalize_plan, self.condition = eps, n_iters, normalize_plan, condition
         self.extractor = SetConvExtractor(extractor_widths, k=k, descriptors=descriptors)
-        self.transfer = PoseTransferStack(extractor_widths[-1], widths, spectral=spectral, residual=residual)
+        cond_features = extractor_widths[-1] if condition == "features" else descriptors
+        self.transfer = PoseTransferStack(cond_features, widths, spectral=spectral, residual=residual)
         self.register_buffer("descriptor_mean", torch.zeros(descriptors))
         self.register_buffer("descriptor_std", torch.ones(descriptors))
         self.reset_parameters()
@@ -146,10 +156,17 @@ class PoseTransferGenerator(nn.Module):
         """Features ``(B, N, D)`` of meshes ``(B, N, 3)``; pass them to :meth:`forward` when one mesh serves twice."""
         if verts.dim() != 3 or verts.shape[2] != 3:
             raise ValueError(f"a mesh batch must have shape (B, V, 3), got {tuple(verts.shape)}")
-        if descriptors is not None and descriptors.shape[2:] == self.descriptor_mean.shape:
-            # Standardised signatures have long tails where a mesh has spikes; four deviations hold all that is signal.
-            descriptors = ((descriptors - self.descriptor_mean) / self.descriptor_std).clamp(-4, 4)
+        if descriptors is not None:
+            descriptors = self._standardise(descriptors)
         return self.extractor(verts, descriptors=descriptors, mask=mask)
+
+    def _standardise(self, descriptors: Tensor) -> Tensor:
+        if descriptors.shape[2:] != self.descriptor_mean.shape:
+            raise ValueError(
+                f"this model takes {len(self.descriptor_mean)} descriptor channels, got {tuple(descriptors.shape)}"
+            )
+        # Signatures have long tails where a mesh has spikes; four deviations hold all that is signal.
+        return ((descriptors - self.descriptor_mean) / self.descriptor_std).clamp(-4, 4)
 
     def forward(
         self,
@@ -163,7 +180,10 @@ class PoseTransferGenerator(nn.Module):
         identity_features: Tensor | None = None,
         pose_features: Tensor | None = None,
     ) -> GeneratorOutput:
-        """Give the identity mesh the pose of the pose mesh; features are computed unless given."""
+        """Give the identity mesh the pose of the pose mesh; features are computed unless given.
+
+        With ``condition="descriptors"``, ``identity_descriptors`` are needed even beside given features.
+        """
         if len(identity) != len(pose):
             raise ValueError(f"identity and pose batches differ: {tuple(identity.shape)} and {tuple(pose.shape)}")
         if identity_features is None:
@@ -182,7 +202,12 @@ class PoseTransferGenerator(nn.Module):
             pose = pose.masked_fill(~pose_mask[..., None], 0.0)
         values = pose.to(plan.kernel.dtype)
         warped = plan.barycentric(values) if self.normalize_plan else plan @ values
-        vertices = self.transfer(warped.to(identity.dtype), identity_features, mask=identity_mask)
+        condition = identity_features
+        if self.condition == "descriptors":
+            if identity_descriptors is None:
+                raise ValueError('condition="descriptors" needs identity_descriptors, also beside identity_features')
+            condition = self._standardise(identity_descriptors)
+        vertices = self.transfer(warped.to(identity.dtype), condition, mask=identity_mask)
         if identity_mask is not None:
             vertices = vertices.masked_fill(~identity_mask[..., None], 0.0)
         return GeneratorOutput(vertices, warped, plan)

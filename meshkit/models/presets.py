@@ -19,8 +19,9 @@ class GeneratorConfig:
     The defaults are the paper's sizes.
 
     Args:
-        descriptors: ``"none"`` (coordinates alone, the paper) or ``"wks"`` (wave-kernel signatures besides).
-        descriptor_channels: how many signatures, when there are any.
+        descriptors: ``"none"`` (coordinates alone, the paper) or ``"wks"``
+            (:func:`~meshkit.descriptors.intrinsic_descriptors` besides).
+        num_signatures: how many wave-kernel signatures, when there are any.
     """
 
     extractor_widths: tuple[int, ...] = (32, 64, 128)
@@ -31,16 +32,17 @@ class GeneratorConfig:
     spectral: bool = True
     residual: bool = False
     normalize_plan: bool = True
+    condition: str = "features"
     descriptors: str = "none"
-    descriptor_channels: int = 16
+    num_signatures: int = 16
 
     def build(self) -> PoseTransferGenerator:
         """The generator of this configuration, freshly initialised."""
         if self.descriptors not in ("none", "wks"):
             raise ValueError(f'descriptors must be "none" or "wks", got {self.descriptors!r}')
         arguments = asdict(self)
-        channels = arguments.pop("descriptor_channels")
-        arguments["descriptors"] = channels if self.descriptors == "wks" else 0
+        signatures = arguments.pop("num_signatures")
+        arguments["descriptors"] = signatures + 1 if self.descriptors == "wks" else 0
         return PoseTransferGenerator(**arguments)
 
     @classmethod
@@ -61,7 +63,14 @@ class GeneratorConfig:
 
 PRESETS = {
     "paper": GeneratorConfig(),
-    "tiny": GeneratorConfig(extractor_widths=(16, 32, 64), k=16, widths=(256, 128, 64), descriptors="wks"),
+    "tiny": GeneratorConfig(
+        extractor_widths=(16, 32, 32),
+        k=8,
+        widths=(256, 128, 64),
+        residual=True,
+        condition="descriptors",
+        descriptors="wks",
+    ),
 }
 
 
@@ -69,8 +78,9 @@ def xdualnet(preset: str = "paper") -> PoseTransferGenerator:
     """X-DualNet's generator (3D-CoreNet's as well: they differ in the training objective).
 
     Args:
-        preset: ``"paper"`` (extractor 32/64/128 over 32 neighbours, blocks 1024/512/256) or ``"tiny"`` (16/32/64 over
-            16 neighbours, blocks 256/128/64, wave-kernel signatures at the input), which trains on a laptop's CPU.
+        preset: ``"paper"`` (extractor 32/64/128 over 32 neighbours, blocks 1024/512/256) or ``"tiny"`` (16/32/32 over
+            8 neighbours, blocks 256/128/64 that displace the warped mesh, intrinsic descriptors at the extractor's
+            input and as the blocks' condition), which trains on a laptop's CPU.
 
     Example:
         >>> sum(p.numel() for p in xdualnet("tiny").parameters()) < 2_000_000

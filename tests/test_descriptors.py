@@ -1,0 +1,402 @@
+"""Laplacian spectra against a dense solver and the sphere; wave-kernel signatures against their definition."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+from conftest import assert_near, rand, scatter, scattered_mask
+from torch import Tensor
+
+from meshkit.data import load_humans
+from meshkit.descriptors import intrinsic_descriptors, laplacian_eigenpairs, wave_kernel_signature
+from meshkit.topology import cotangent_laplacian, mass_matrix
+
+Mesh = tuple[Tensor, Tensor]
+
+
+@cache
+def sphere(level: int = 2, noise: float = 0.0) -> Mesh:
+    """Subdivided octahedron on the unit sphere: 4^(level + 1) + 2 vertices, optionally bumpy."""
+    verts = [tuple(v) for v in torch.cat([torch.eye(3), -torch.eye(3)]).double().tolist()]
+    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+    for _ in range(level):
+        middle: dict[frozenset[int], int] = {}
+        finer = []
+        for face in faces:
+            halves = []
+            for i, j in zip(face, face[1:] + face[:1], strict=True):
+                if frozenset((i, j)) not in middle:
+                    middle[frozenset((i, j))] = len(verts)
+                    point = np.add(verts[i], verts[j])
+                    verts.append(tuple(point / np.linalg.norm(point)))
+                halves.append(middle[frozenset((i, j))])
+            (a, b, c), (ab, bc, ca) = face, halves
+            finer += [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+        faces = finer
+    points = torch.tensor(verts, dtype=torch.float64)
+    return points * (1 + noise * rand(len(points), 1)), torch.tensor(faces)
+
+
+@cache
+def body() -> Mesh:
+    human = load_humans(1000)
+    return human.template.double(), human.faces
+
+
+def grid(rows: int, columns: int) -> Mesh:
+    """Flat sheet, its vertices moved within the columns so that no two triangles are alike."""
+    verts = torch.cartesian_prod(torch.arange(float(rows)), torch.arange(float(columns))).double()
+    verts[:, 1] += 0.1 * rand(len(verts))
+    corner = (torch.arange(rows - 1)[:, None] * columns + torch.arange(columns - 1)).flatten()
+    lower = torch.stack([corner, corner + columns, corner + 1], 1)
+    upper = torch.stack([corner + 1, corner + columns, corner + columns + 1], 1)
+    return torch.cat([verts, torch.zeros(len(verts), 1)], 1), torch.cat([lower, upper])
+
+
+@cache
+def dense_eigenpairs(name: str) -> tuple[np.ndarray, np.ndarray]:
+    verts, faces = MESHES[name]()
+    mass = mass_matrix(verts, faces).numpy()
+    return scipy.linalg.eigh(cotangent_laplacian(verts, faces).to_dense().numpy(), np.diag(mass / mass.sum()))
+
+
+MESHES = {"sphere": lambda: sphere(2, 0.05), "body": body, "sheet": lambda: grid(9, 7)}
+meshes = pytest.mark.parametrize("name", list(MESHES))
+
+
+def wks_literally(eigenvalues: np.ndarray, vectors: np.ndarray, count: int, width: float) -> np.ndarray:
+    """Loops over vertices and energies of the definition; the first (constant) pair is left out."""
+    lam, phi = eigenvalues[1:], vectors[:, 1:]
+    low, high = math.log(lam[0]), 0.98 * math.log(lam[-1])
+    energies = [low + i * (high - low) / (count - 1) for i in range(count)]
+    sigma = width * (energies[1] - energies[0])
+    out = np.empty((len(phi), count))
+    for e, energy in enumerate(energies):
+        bands = [math.exp(-((energy - math.log(value)) ** 2) / (2 * sigma**2)) for value in lam]
+        for v in range(len(phi)):
+            out[v, e] = sum(phi[v, k] ** 2 * bands[k] for k in range(len(lam))) / sum(bands)
+    return out
+
+
+# Eigenpairs
+
+
+@meshes
+def test_eigenpairs_equal_the_dense_solver(name):
+    verts, faces = MESHES[name]()
+    k = 20
+    eigenvalues, vectors = laplacian_eigenpairs(verts, faces, k)
+    expected, dense = dense_eigenpairs(name)
+    assert eigenvalues.shape == (k,) and vectors.shape == (len(verts), k)
+    assert (eigenvalues.diff() >= 0).all() and eigenvalues[0] < 1e-8
+    np.testing.assert_allclose(eigenvalues[1:], expected[1:k], rtol=1e-8)
+    mass = mass_matrix(verts, faces)
+    mass = mass / mass.sum()
+    assert_near(vectors.T @ (mass[:, None] * vectors), torch.eye(k, dtype=torch.float64), 1e-8)
+    # Simple eigenvalues here: the vectors agree up to sign.
+    overlap = (vectors * mass[:, None] * torch.from_numpy(dense[:, :k])).sum(0).abs()
+    assert_near(overlap, torch.ones_like(overlap), 1e-6)
+
+
+@pytest.mark.parametrize("k", [1, 5, 17])
+def test_any_number_of_pairs(k):
+    verts, faces = sphere(1, 0.1)  # 18 vertices: 17 is the most
+    expected = scipy.linalg.eigh(
+        cotangent_laplacian(verts, faces).to_dense().numpy(),
+        np.diag((mass_matrix(verts, faces) / mass_matrix(verts, faces).sum()).numpy()),
+        eigvals_only=True,
+    )
+    np.testing.assert_allclose(laplacian_eigenpairs(verts, faces, k)[0], expected[:k], rtol=1e-8, atol=1e-8)
+
+
+def test_spectrum_of_the_sphere():
+    """Area normalised to 1: l (l + 1) times 4 pi, each 2 l + 1 times."""
+    eigenvalues, vectors = laplacian_eigenpairs(*sphere(4), 16)
+    expected = [degree * (degree + 1) * 4 * math.pi for degree in range(4) for _ in range(2 * degree + 1)]
+    np.testing.assert_allclose(eigenvalues, expected, rtol=0.02, atol=1e-8)
+    assert_near(vectors[:, 0].abs(), torch.ones(len(vectors), dtype=torch.float64), 1e-6)
+    # By the addition theorem the squares of one degree sum to 2 l + 1 at every point.
+    for degree in (1, 2, 3):
+        total = vectors[:, degree**2 : (degree + 1) ** 2].square().sum(1)
+        assert_near(total, torch.full_like(total, 2 * degree + 1), 0.03)
+
+
+@pytest.mark.parametrize(("level", "k"), [(2, 16), (2, 40), (3, 32), (3, 50)])
+def test_repeated_eigenvalues_are_all_found(level, k):
+    """A subdivided octahedron has eigenvalues of multiplicity exactly 2 and 3; the vertex order must not matter."""
+    verts, faces = sphere(level)
+    mass = mass_matrix(verts, faces)
+    stiffness = cotangent_laplacian(verts, faces).to_dense().numpy()
+    expected = scipy.linalg.eigh(stiffness, np.diag((mass / mass.sum()).numpy()), eigvals_only=True)[:k]
+    for seed in range(3):
+        order = torch.randperm(len(verts), generator=torch.Generator().manual_seed(seed))
+        eigenvalues, _ = laplacian_eigenpairs(verts[order], order.argsort()[faces], k)
+        np.testing.assert_allclose(eigenvalues, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_components_give_as_many_zero_eigenvalues():
+    verts, faces = sphere(1, 0.1)
+    eigenvalues, _ = laplacian_eigenpairs(torch.cat([verts, verts + 5]), torch.cat([faces, faces + 18]), 4)
+    assert (eigenvalues[:2] < 1e-8).all() and (eigenvalues[2:] > 1).all()
+
+
+def test_eigenpairs_follow_the_dtype_and_repeat():
+    verts, faces = sphere(2, 0.05)
+    single = laplacian_eigenpairs(verts.float(), faces, 10)
+    assert {t.dtype for t in single} == {torch.float32}
+    np.testing.assert_allclose(single[0][1:], laplacian_eigenpairs(verts, faces, 10)[0][1:], rtol=1e-4)
+    for first, again in zip(single, laplacian_eigenpairs(verts.float(), faces, 10), strict=True):
+        assert torch.equal(first, again)
+    assert not laplacian_eigenpairs(verts.clone().requires_grad_(), faces, 3)[1].requires_grad
+
+
+# Wave-kernel signature
+
+
+@meshes
+@pytest.mark.parametrize(("count", "pairs", "width"), [(16, 20, 7.0), (5, 12, 2.0)])
+def test_signature_equals_its_definition(name, count, pairs, width):
+    verts, faces = MESHES[name]()
+    value = wave_kernel_signature(verts, faces, num_signatures=count, num_eigenpairs=pairs, width=width)
+    expected, vectors = dense_eigenpairs(name)
+    literal = wks_literally(expected[:pairs], vectors[:, :pairs], count, width)
+    assert_near(value, torch.from_numpy(literal), 1e-6)
+
+
+def test_defaults():
+    verts, faces = sphere(2, 0.05)
+    value = wave_kernel_signature(verts, faces)
+    expected, vectors = dense_eigenpairs("sphere")
+    assert_near(value, torch.from_numpy(wks_literally(expected[:64], vectors[:, :64], 16, 7.0)), 1e-6)
+
+
+def test_mean_over_the_surface_is_one():
+    """Every phi_k has unit norm, hence so has every average of their squares."""
+    for make in MESHES.values():
+        verts, faces = make()
+        mass = mass_matrix(verts, faces)
+        mean = (mass / mass.sum()) @ wave_kernel_signature(verts, faces, num_eigenpairs=20)
+        assert_near(mean, torch.ones(16, dtype=torch.float64), 1e-8)
+
+
+def rotation() -> Tensor:
+    return torch.linalg.qr(rand(3, 3))[0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda v: v @ rotation().T,
+        lambda v: v * torch.tensor([-1.0, 1.0, 1.0]),
+        lambda v: v + torch.tensor([30.0, -4.0, 7.0]),
+        lambda v: v * 1000,
+        lambda v: v * 1e-3,
+    ],
+    ids=["rotation", "reflection", "translation", "metres-to-millimetres", "smaller"],
+)
+@pytest.mark.parametrize("name", ["sphere", "body"])
+def test_invariance_under_similarities(name, change):
+    verts, faces = MESHES[name]()
+    value = wave_kernel_signature(change(verts), faces, num_eigenpairs=20)
+    assert_near(value, wave_kernel_signature(verts, faces, num_eigenpairs=20), 1e-6)
+
+
+@pytest.mark.parametrize("name", ["sphere", "body"])
+def test_vertex_and_face_order_do_not_matter(name):
+    verts, faces = MESHES[name]()
+    generator = torch.Generator().manual_seed(0)
+    order = torch.randperm(len(verts), generator=generator)
+    shuffled = order.argsort()[faces][torch.randperm(len(faces), generator=generator)].roll(1, 1)
+    value = wave_kernel_signature(verts[order], shuffled, num_eigenpairs=20)
+    assert_near(value, wave_kernel_signature(verts, faces, num_eigenpairs=20)[order], 1e-6)
+
+
+def test_invariance_under_bending_that_keeps_lengths():
+    """Rolling a sheet up along its rows folds it at edges only: every triangle keeps its shape."""
+    flat, faces = grid(9, 7)
+    angle = 0.5 * flat[:, 0]
+    radius = 0.5 / math.sin(0.25)  # chords of 1 between neighbouring rows
+    rolled = torch.stack([radius * angle.sin(), flat[:, 1], radius * angle.cos()], 1)
+    lengths = [(v[faces] - v[faces.roll(1, 1)]).norm(dim=2) for v in (flat, rolled)]
+    assert_near(lengths[1], lengths[0], 1e-12)
+    assert_near(
+        wave_kernel_signature(rolled, faces, num_eigenpairs=20),
+        wave_kernel_signature(flat, faces, num_eigenpairs=20),
+        1e-6,
+    )
+
+
+def test_signature_tells_parts_of_a_body_apart():
+    """Not a constant: deviations over the body exceed a tenth of the mean in every band."""
+    value = wave_kernel_signature(*body(), num_eigenpairs=20)
+    assert (value.std(0) > 0.1).all() and (value > 0).all()
+
+
+# Batches
+
+
+def ragged(fill: float) -> tuple[Tensor, Tensor, Tensor, list[Mesh]]:
+    """Padding anywhere, faces numbered in the padded batch and padded with -1; and the separate meshes."""
+    singles = [sphere(1, 0.1), sphere(2, 0.05), grid(5, 4)]
+    mask = scattered_mask([len(v) for v, _ in singles], 70)
+    verts = scatter([v for v, _ in singles], mask, fill)
+    faces = torch.full((3, max(len(f) for _, f in singles), 3), -1)
+    for b, (_, f) in enumerate(singles):
+        faces[b, : len(f)] = mask[b].nonzero()[:, 0][f]
+    return verts, faces, mask, singles
+
+
+@pytest.mark.parametrize("fill", [0.0, 1e20, math.nan])
+def test_padded_batch_equals_the_loop(fill):
+    verts, faces, mask, singles = ragged(fill)
+    value = wave_kernel_signature(verts, faces, num_signatures=6, num_eigenpairs=12, mask=mask)
+    assert value.shape == (3, 70, 6)
+    assert (value[~mask] == 0).all()
+    for b, (v, f) in enumerate(singles):
+        assert_near(value[b, mask[b]], wave_kernel_signature(v, f, num_signatures=6, num_eigenpairs=12), 1e-6)
+
+
+def test_batch_of_one_topology():
+    verts, faces = sphere(1, 0.1)
+    batch = torch.stack([verts, verts * torch.tensor([1.0, 2.0, 3.0])])
+    value = wave_kernel_signature(batch, faces, num_eigenpairs=10)
+    for b in range(2):
+        assert_near(value[b], wave_kernel_signature(batch[b], faces, num_eigenpairs=10), 1e-8)
+
+
+def test_padding_of_shared_faces_is_no_face():
+    verts, faces = sphere(1, 0.1)
+    padded = torch.cat([faces, torch.full((2, 3), -1)])
+    expected = wave_kernel_signature(verts, faces, num_eigenpairs=10)
+    for given in (padded, padded[None]):
+        assert_near(wave_kernel_signature(verts[None], given, num_eigenpairs=10)[0], expected, 1e-8)
+    everything = torch.ones(1, len(verts), dtype=torch.bool)
+    for given in (padded, padded[None]):
+        value = wave_kernel_signature(verts[None], given, num_eigenpairs=10, mask=everything)
+        assert_near(value[0], expected, 1e-8)
+
+
+def test_fewer_pairs_are_taken_on_small_meshes():
+    verts, faces = sphere(1, 0.1)
+    assert_near(
+        wave_kernel_signature(verts, faces, num_eigenpairs=500),
+        wave_kernel_signature(verts, faces, num_eigenpairs=17),
+        1e-8,
+    )
+
+
+def test_signature_dtype_and_gradient():
+    verts, faces = sphere(1, 0.1)
+    value = wave_kernel_signature(verts.float().requires_grad_(), faces, num_eigenpairs=10)
+    assert value.dtype == torch.float32 and not value.requires_grad
+    assert_near(value, wave_kernel_signature(verts, faces, num_eigenpairs=10), 1e-4)
+
+
+# Intrinsic descriptors
+
+
+def area_literally(verts: Tensor, faces: Tensor) -> float:
+    a, b, c = verts[faces].unbind(1)
+    return torch.linalg.cross(b - a, c - a).norm(dim=1).sum().item() / 2
+
+
+@meshes
+def test_intrinsic_descriptors_add_the_size(name):
+    verts, faces = MESHES[name]()
+    for scale in (1.0, 3.0):
+        value = intrinsic_descriptors(scale * verts, faces, num_signatures=5, num_eigenpairs=20)
+        assert value.shape == (len(verts), 6)
+        signature = wave_kernel_signature(verts, faces, num_signatures=5, num_eigenpairs=20)
+        assert_near(value[:, :5], signature, 1e-6)
+        size = torch.full((len(verts),), math.log(scale * math.sqrt(area_literally(verts, faces))), dtype=torch.float64)
+        assert_near(value[:, 5], size, 1e-12)
+
+
+@pytest.mark.parametrize("fill", [0.0, 1e20, math.nan])
+def test_intrinsic_descriptors_of_a_padded_batch_equal_the_loop(fill):
+    verts, faces, mask, singles = ragged(fill)
+    value = intrinsic_descriptors(verts, faces, num_signatures=6, num_eigenpairs=12, mask=mask)
+    assert value.shape == (3, 70, 7)
+    assert (value[~mask] == 0).all()
+    for b, (v, f) in enumerate(singles):
+        assert_near(value[b, mask[b]], intrinsic_descriptors(v, f, num_signatures=6, num_eigenpairs=12), 1e-6)
+    shared = torch.stack([singles[0][0], 2 * singles[0][0]])
+    value = intrinsic_descriptors(shared, singles[0][1], num_eigenpairs=10)
+    assert_near(value[1, :, -1] - value[0, :, -1], torch.full((18,), math.log(2), dtype=torch.float64), 1e-12)
+
+
+def test_intrinsic_descriptors_have_the_defaults_of_the_signature_and_no_gradient():
+    verts, faces = sphere(2, 0.05)
+    value = intrinsic_descriptors(verts.float().requires_grad_(), faces)
+    assert value.dtype == torch.float32 and not value.requires_grad
+    assert_near(value[:, :-1], wave_kernel_signature(verts.float(), faces), 1e-6)
+
+
+# Errors
+
+
+def spoil(kind: str) -> Mesh:
+    verts, faces = sphere(1)
+    verts = verts.clone()
+    if kind == "nan":
+        verts[3, 1] = math.nan
+    elif kind == "infinite":
+        verts[2:4] = math.inf
+    elif kind == "unreferenced":
+        verts = torch.cat([verts, torch.zeros(2, 3)])
+    elif kind == "no area":  # the faces around vertex 0 collapse to it
+        around = (faces == 0).any(1)
+        verts[faces[around].unique()] = verts[0].clone()
+    elif kind == "index":
+        faces = faces + 1
+    return verts, faces
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("nan", "1 of 18 vertices are NaN or infinite"),
+        ("infinite", "2 of 18 vertices are NaN or infinite"),
+        ("unreferenced", "2 of 20 vertices belong to no face of positive area: remove them first"),
+        ("no area", "1 of 18 vertices belong to no face of positive area"),
+        ("index", "face indices must lie in"),
+    ],
+)
+def test_bad_meshes_are_named(kind, message):
+    verts, faces = spoil(kind)
+    with pytest.raises(ValueError, match=message):
+        laplacian_eigenpairs(verts, faces, 5)
+    with pytest.raises(ValueError, match=message):
+        wave_kernel_signature(verts, faces, num_eigenpairs=5)
+    with pytest.raises(ValueError, match=message):
+        wave_kernel_signature(verts[None], faces, num_eigenpairs=5)
+    with pytest.raises(ValueError, match=message):
+        intrinsic_descriptors(verts, faces, num_eigenpairs=5)
+
+
+@pytest.mark.parametrize("k", [0, 18, -1])
+def test_number_of_pairs_out_of_range(k):
+    with pytest.raises(ValueError, match=rf"k must lie in \[1, V - 1\] = \[1, 17\], got {k}"):
+        laplacian_eigenpairs(*sphere(1), k)
+
+
+def test_shape_errors():
+    verts, faces = sphere(1)
+    for bad in (verts[None], verts[:, :2], verts[0]):
+        with pytest.raises(ValueError, match=r"verts must have shape \(V, 3\), got"):
+            laplacian_eigenpairs(bad, faces, 5)
+    with pytest.raises(ValueError, match=r"verts must have shape \(V, 3\) or \(B, V, 3\), got \(18,\)"):
+        wave_kernel_signature(verts[:, 0], faces)
+
+
+def test_meshes_and_spectra_too_small():
+    triangle = torch.eye(3).double(), torch.tensor([[0, 1, 2]])
+    with pytest.raises(ValueError, match="at least 4 vertices, got 3"):
+        wave_kernel_signature(*triangle)
+    with pytest.raises(ValueError, match="num_signatures must be at least 2, got 1"):
+        wave_kernel_signature(*sphere(1), num_signatures=1)
+    with pytest.raises(ValueError, match="num_eigenpairs"):
+        wave_kernel_signature(*sphere(1), num_eigenpairs=1)

@@ -1,0 +1,436 @@
+"""The generator against a composition of its parts written out, its symmetries, and checkpoints."""
+
+import json
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import GARBAGE, assert_near, rand, scatter, scattered_mask
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from meshkit.models import (
+    GeneratorConfig,
+    GeneratorOutput,
+    PoseTransferGenerator,
+    PoseTransferStack,
+    load_generator,
+    xdualnet,
+)
+
+SIZES = {"extractor_widths": (5, 6), "k": 4, "widths": (8, 7)}
+
+
+def make(**options) -> PoseTransferGenerator:
+    """A small float64 generator in evaluation mode whose output is far from zero."""
+    torch.manual_seed(0)
+    net = PoseTransferGenerator(**{**SIZES, **options}).double()
+    last = net.transfer.narrow[-1]
+    last.weight.data = rand(*last.weight.shape)
+    return net.eval()
+
+
+def forward_literally(net: PoseTransferGenerator, identity: Tensor, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """One pair (N, 3), (M, 3): match, warp and refine, step by step; returns vertices, warped mesh and plan."""
+    f_id, f_pose = net.encode(identity[None])[0], net.encode(pose[None])[0]
+    cosine = nn.functional.normalize(f_id, dim=1) @ nn.functional.normalize(f_pose, dim=1).T
+    kernel = torch.exp(-(1 - cosine) / 0.03)
+    a = torch.full((len(identity),), 1 / len(identity), dtype=kernel.dtype)
+    for _ in range(5):
+        b = 1 / len(pose) / (kernel.T @ a)
+        a = 1 / len(identity) / (kernel @ b)
+    plan = a[:, None] * kernel * b
+    warped = plan / plan.sum(1, keepdim=True) @ pose
+    x = net.transfer.mix(net.transfer.lift(warped[None]))
+    for block, narrow in zip(net.transfer.blocks, net.transfer.narrow, strict=True):
+        x = narrow(block(x, f_id[None]))
+    return 2 * torch.tanh(x[0]), warped, plan
+
+
+# The forward pass
+
+
+def test_generator_equals_its_parts():
+    net, identity, pose = make(), rand(2, 12, 3), rand(2, 17, 3, seed=1)
+    result = net(identity, pose)
+    assert isinstance(result, GeneratorOutput)
+    assert result.vertices.shape == result.warped.shape == (2, 12, 3) and result.plan.shape == (2, 12, 17)
+    for b in range(2):
+        for value, expected in zip(
+            (result.vertices[b], result.warped[b], result.plan.dense()[b]),
+            forward_literally(net, identity[b], pose[b]),
+            strict=True,
+        ):
+            assert_near(value, expected, 1e-10)
+
+
+def test_eps_and_iterations_reach_the_matching():
+    identity, pose = rand(1, 12, 3), rand(1, 17, 3, seed=1)
+    plans = [make(**o)(identity, pose).plan.dense() for o in ({}, {"eps": 0.1}, {"n_iters": 1})]
+    for plan in plans[1:]:
+        assert (plan - plans[0]).abs().amax() > 1e-4
+
+
+def test_residual_adds_the_warped_mesh():
+    plain, residual = make(), make(residual=True)
+    residual.load_state_dict(plain.state_dict())
+    identity, pose = rand(1, 12, 3), rand(1, 17, 3, seed=1)
+    expected, result = plain(identity, pose), residual(identity, pose)
+    assert_near(result.vertices, expected.vertices + expected.warped, 1e-12)
+
+
+def test_raw_plan_shrinks_the_warped_mesh_by_the_number_of_vertices():
+    normalised, raw = make(), make(normalize_plan=False)
+    raw.load_state_dict(normalised.state_dict())
+    identity, pose = rand(1, 12, 3), rand(1, 17, 3, seed=1)
+    result = raw(identity, pose)
+    assert_near(12 * result.warped, normalised(identity, pose).warped, 1e-12)
+    assert_near(result.warped, result.plan.dense() @ pose, 1e-12)
+
+
+def test_output_stays_within_two_units():
+    net = make()
+    net.transfer.narrow[-1].bias.data.fill_(100)
+    assert_near(net(rand(1, 12, 3), rand(1, 9, 3)).vertices, torch.full((1, 12, 3), 2.0), 1e-6)
+
+
+def test_stack_lifts_by_one_map():
+    """The composed 3 -> w_0 map against the two maps one after the other."""
+    stack = PoseTransferStack(4, (6,), spectral=False).double()
+    warped, features = rand(2, 9, 3), rand(2, 9, 4, seed=1)
+    x = stack.narrow[0](stack.blocks[0](stack.mix(stack.lift(warped)), features))
+    assert_near(stack(warped, features), 2 * x.tanh(), 1e-12)
+
+
+# Symmetries and padding
+
+
+def test_permuting_the_identity_permutes_the_output():
+    net, identity, pose, order = make(), rand(1, 12, 3), rand(1, 17, 3, seed=1), torch.randperm(12)
+    expected, result = net(identity, pose), net(identity[:, order], pose)
+    assert_near(result.vertices, expected.vertices[:, order], 1e-10)
+    assert_near(result.warped, expected.warped[:, order], 1e-10)
+
+
+def test_permuting_the_pose_changes_the_columns_of_the_plan_alone():
+    net, identity, pose, order = make(), rand(1, 12, 3), rand(1, 17, 3, seed=1), torch.randperm(17)
+    expected, result = net(identity, pose), net(identity, pose[:, order])
+    assert_near(result.vertices, expected.vertices, 1e-10)
+    assert_near(result.warped, expected.warped, 1e-10)
+    assert_near(result.plan.dense(), expected.plan.dense()[:, :, order], 1e-10)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"descriptors": 2, "residual": True},
+        {"descriptors": 2, "condition": "descriptors"},
+        {"normalize_plan": False},
+    ],
+)
+@pytest.mark.parametrize("garbage", GARBAGE)
+def test_padded_batch_equals_the_loop(garbage, options):
+    net, id_sizes, pose_sizes = make(**options), [8, 11], [9, 6]
+    ids, poses = [rand(n, 3, seed=n) for n in id_sizes], [rand(n, 3, seed=n + 50) for n in pose_sizes]
+    id_mask, pose_mask = scattered_mask(id_sizes, 13), scattered_mask(pose_sizes, 10, seed=1)
+    identity, pose = (scatter(s, m, garbage).requires_grad_() for s, m in ((ids, id_mask), (poses, pose_mask)))
+    extras = [{}, {}]
+    padded: dict[str, Tensor] = {}
+    if "descriptors" in options:
+        id_d, pose_d = [rand(n, 2, seed=n) for n in id_sizes], [rand(n, 2, seed=n) for n in pose_sizes]
+        extras = [
+            {"identity_descriptors": i[None], "pose_descriptors": p[None]} for i, p in zip(id_d, pose_d, strict=True)
+        ]
+        padded = {
+            "identity_descriptors": scatter(id_d, id_mask, garbage),
+            "pose_descriptors": scatter(pose_d, pose_mask, garbage),
+        }
+    result = net(identity, pose, identity_mask=id_mask, pose_mask=pose_mask, **padded)
+    leaves = [[m.clone().requires_grad_() for m in meshes] for meshes in (ids, poses)]
+    singles = [net(i[None], p[None], **e) for i, p, e in zip(*leaves, extras, strict=True)]
+    assert_near(result.vertices[id_mask], torch.cat([s.vertices[0] for s in singles]), 1e-10)
+    assert_near(result.warped[id_mask], torch.cat([s.warped[0] for s in singles]), 1e-10)
+    assert (result.vertices[~id_mask] == 0).all()
+    parameters = list(net.parameters())
+    upstream = rand(19, 3, seed=99)
+    got = torch.autograd.grad(result.vertices[id_mask], [identity, pose, *parameters], upstream)
+    total = torch.cat([s.vertices[0] for s in singles])
+    truths = torch.autograd.grad(total, [*leaves[0], *leaves[1], *parameters], upstream)
+    for gradient, mask, truth in zip(got[:2], (id_mask, pose_mask), (truths[:2], truths[2:4]), strict=True):
+        assert_near(gradient[mask], torch.cat(truth), 1e-8)
+        assert (gradient[~mask] == 0).all()
+    for gradient, truth in zip(got[2:], truths[4:], strict=True):
+        assert_near(gradient, truth, 1e-8, scale=max(1.0, truth.abs().amax().item()))
+
+
+# Features once, descriptors
+
+
+@pytest.mark.parametrize("descriptors", [0, 2])
+def test_given_features_replace_the_encoder(descriptors, monkeypatch):
+    net, identity, pose = make(descriptors=descriptors), rand(1, 12, 3), rand(1, 17, 3, seed=1)
+    d_id, d_pose = (rand(1, n, 2, seed=n) if descriptors else None for n in (12, 17))
+    expected = net(identity, pose, identity_descriptors=d_id, pose_descriptors=d_pose)
+    f_id, f_pose = net.encode(identity, descriptors=d_id), net.encode(pose, descriptors=d_pose)
+    for given in ({"identity_features": f_id}, {"pose_features": f_pose}):
+        mixed = net(identity, pose, identity_descriptors=d_id, pose_descriptors=d_pose, **given)
+        assert torch.equal(mixed.vertices, expected.vertices)
+    monkeypatch.setattr(net, "encode", None)
+    result = net(identity, pose, identity_features=f_id, pose_features=f_pose)
+    assert torch.equal(result.vertices, expected.vertices)
+
+
+def test_descriptors_are_standardised_and_bounded():
+    net, verts, descriptors = make(descriptors=2), rand(1, 12, 3), rand(1, 12, 2, seed=1)
+    expected = net.encode(verts, descriptors=descriptors)
+    net.descriptor_mean += torch.tensor([5.0, -1.0])
+    net.descriptor_std *= torch.tensor([0.1, 30.0])
+    raw = descriptors * net.descriptor_std + net.descriptor_mean
+    assert_near(net.encode(verts, descriptors=raw), expected, 1e-10)
+    assert {"descriptor_mean", "descriptor_std"} <= net.state_dict().keys()
+    spiked, bounded = raw.clone(), raw.clone()
+    spiked[0, 3] = net.descriptor_mean + 1e6 * net.descriptor_std
+    bounded[0, 3] = net.descriptor_mean + 4 * net.descriptor_std
+    assert_near(net.encode(verts, descriptors=spiked), net.encode(verts, descriptors=bounded), 1e-12)
+
+
+# Conditioning on descriptors alone
+
+
+def test_condition_on_descriptors():
+    """The blocks see the standardised descriptors of the identity; the matching still sees features."""
+    net = make(descriptors=2, condition="descriptors")
+    net.descriptor_mean += 0.5
+    identity, pose = rand(1, 12, 3), rand(1, 17, 3, seed=1)
+    extra = {"identity_descriptors": rand(1, 12, 2), "pose_descriptors": rand(1, 17, 2, seed=1)}
+    result = net(identity, pose, **extra)
+    condition = (extra["identity_descriptors"] - net.descriptor_mean) / net.descriptor_std
+    assert_near(result.vertices, net.transfer(result.warped, condition), 1e-12)
+    features = {
+        f"{n}_features": net.encode(m, descriptors=extra[f"{n}_descriptors"])
+        for n, m in (("identity", identity), ("pose", pose))
+    }
+    assert torch.equal(net(identity, pose, **extra, **features).vertices, result.vertices)
+    with pytest.raises(ValueError, match='condition="descriptors" needs identity_descriptors, also beside'):
+        net(identity, pose, **features)
+
+
+def test_condition_errors():
+    with pytest.raises(ValueError, match='condition must be "features" or "descriptors", got \'pose\''):
+        PoseTransferGenerator(condition="pose")
+    with pytest.raises(ValueError, match='condition="descriptors" needs descriptors'):
+        PoseTransferGenerator(condition="descriptors")
+    assert replace(SMALL, condition="descriptors").build().condition == "descriptors"
+
+
+# Training
+
+
+@pytest.mark.parametrize("options", [{}, {"spectral": False, "residual": True}, {"descriptors": 2}])
+def test_gradients_reach_every_parameter(options):
+    net = make(**options).train()
+    extra = {f"{n}_descriptors": rand(2, 12, 2) for n in ("identity", "pose")} if "descriptors" in options else {}
+    net(rand(2, 12, 3), rand(2, 12, 3, seed=1), **extra).vertices.square().sum().backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all() and parameter.grad.abs().amax() > 1e-9, name
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_training_starts_near_the_centre(residual):
+    """The stack gives decimetres at most, where Xavier's gain on the last layer gives metres."""
+    torch.manual_seed(0)
+    net = replace(GeneratorConfig(), residual=residual).build()
+    identity, pose = (rand(1, 50, 3, seed=s, dtype=torch.float32) for s in (0, 1))
+    sizes = []
+    with torch.no_grad():
+        for gain in (None, 1.0):
+            if gain is not None:
+                nn.init.xavier_normal_(net.transfer.narrow[-1].weight, gain)
+            result = net(identity, pose)
+            stack = result.vertices - result.warped if residual else result.vertices
+            sizes.append(stack.square().mean().sqrt().item())
+    assert sizes[0] < 0.2 and sizes[1] > 1
+
+
+def test_half_precision_autocast_gives_float32_vertices():
+    net = make().float()
+    identity, pose = rand(1, 30, 3, dtype=torch.float32), rand(1, 40, 3, seed=1, dtype=torch.float32)
+    exact = net(identity, pose)
+    with torch.autocast("cpu", torch.bfloat16):
+        result = net(identity, pose)
+    assert result.vertices.dtype == torch.float32 and result.vertices.isfinite().all()
+    assert result.plan.kernel.dtype == torch.float32
+    assert (result.vertices - exact.vertices).square().mean().sqrt() < 0.2
+
+
+# Sizes
+
+
+def elements(module: nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def test_parameter_counts_of_the_paper_by_hand():
+    net = xdualnet("paper")
+    # SetConv: (3 + C) x w, w x w, w x w without bias, and three pairs of scale and shift.
+    first = (3 + 3) * 32 + 2 * 32 * 32 + 6 * 32
+    second = (32 + 3) * 64 + 2 * 64 * 64 + 6 * 64
+    third = (64 + 3) * 128 + 2 * 128 * 128 + 6 * 128
+    assert [elements(conv) for conv in net.extractor.convs] == [first, second, third] == [2432, 10816, 42112]
+    # ElaIN: 128 -> w, w -> w twice, 2w -> w, with biases; a block has three, and three maps of which one is unbiased.
+    for block, w in zip(net.transfer.blocks, (1024, 512, 256), strict=True):
+        norm = (128 * w + w) + 2 * (w * w + w) + (2 * w * w + w)
+        assert elements(block) == 3 * norm + 3 * w * w + 2 * w
+    ends = (3 * 1024 + 1024) + (1024 * 1024 + 1024)
+    ends += (1024 * 512 + 512) + (512 * 256 + 256) + (256 * 3 + 3)
+    assert elements(net) == first + second + third + ends + sum(elements(block) for block in net.transfer.blocks)
+
+
+def test_presets():
+    paper, tiny = xdualnet(), xdualnet("tiny")
+    assert (paper.extractor.k, paper.eps, paper.n_iters, paper.normalize_plan) == (32, 0.03, 5, True)
+    assert paper.extractor.descriptors == 0 and paper.condition == "features" and not paper.transfer.residual
+    assert tiny.extractor.descriptors == GeneratorConfig().num_signatures + 1 and tiny.condition == "descriptors"
+    assert elements(tiny) < elements(paper) / 10
+    with pytest.raises(ValueError, match=r"preset must be one of \['paper', 'tiny'\], got 'huge'"):
+        xdualnet("huge")
+
+
+@pytest.mark.parametrize("spectral", [True, False])
+def test_spectral_normalisation_sits_on_the_blocks_alone(spectral):
+    net = make(spectral=spectral)
+    normed = {name for name, module in net.named_modules() if hasattr(module, "parametrizations")}
+    expected = {f"transfer.blocks.{b}.conv_{c}" for b in range(2) for c in "01s"} if spectral else set()
+    assert normed == expected
+
+
+# Errors of the forward pass
+
+
+def test_generator_errors():
+    net, mesh = make(), rand(2, 9, 3)
+    with pytest.raises(ValueError, match=r"identity and pose batches differ: \(2, 9, 3\) and \(1, 9, 3\)"):
+        net(mesh, mesh[:1])
+    for bad in (mesh[0], mesh[..., :2]):
+        with pytest.raises(ValueError, match=r"must have shape \(B, V, 3\), got"):
+            net(bad, bad)
+    with pytest.raises(ValueError, match="k=4 neighbours"):
+        net(mesh[:, :3], mesh)
+    with pytest.raises(ValueError, match="takes 2 descriptor channels, got 0"):
+        make(descriptors=2)(mesh, mesh)
+    with pytest.raises(ValueError, match=r"takes 2 descriptor channels, got \(2, 9, 3\)"):
+        make(descriptors=2)(mesh, mesh, identity_descriptors=mesh, pose_descriptors=mesh)
+
+
+# Configurations and checkpoints
+
+SMALL = GeneratorConfig(**SIZES, descriptors="wks", num_signatures=2, eps=0.1, n_iters=3, spectral=False)
+
+
+@pytest.mark.parametrize("config", [GeneratorConfig(), SMALL, replace(SMALL, residual=True, normalize_plan=False)])
+def test_configuration_survives_json(config):
+    assert GeneratorConfig.from_json(json.dumps(asdict(config))) == config
+
+
+def test_configuration_reaches_the_generator():
+    net = replace(SMALL, residual=True, normalize_plan=False).build()
+    assert (net.eps, net.n_iters, net.normalize_plan, net.transfer.residual) == (0.1, 3, False, True)
+    assert net.extractor.descriptors == 3 and net.extractor.k == 4  # two signatures and the size
+    assert [conv.out_features for conv in net.extractor.convs] == [5, 6]
+    assert replace(SMALL, descriptors="none").build().extractor.descriptors == 0
+    assert GeneratorConfig.from_json('{"k": 7}') == GeneratorConfig(k=7)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "the model configuration is not JSON"),
+        ("", "the model configuration is not JSON"),
+        ('{"kk": 3, "k": 3}', r"unknown fields \['kk'\] .* known: \['extractor_widths', 'k'"),
+        ("3", "model configuration"),
+        ("[]", "model configuration"),
+        ("null", "model configuration"),
+    ],
+)
+def test_configuration_errors(text, message):
+    with pytest.raises(ValueError, match=message):
+        GeneratorConfig.from_json(text)
+
+
+def test_unknown_descriptors():
+    with pytest.raises(ValueError, match='must be "none" or "wks", got \'hks\''):
+        GeneratorConfig(descriptors="hks").build()
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> tuple[Path, PoseTransferGenerator]:
+    """The folder of a run, and the generator saved there."""
+    torch.manual_seed(1)
+    net = replace(SMALL, spectral=True).build()
+    net.descriptor_mean += 0.5
+    save_file(net.state_dict(), tmp_path / "model.safetensors")
+    (tmp_path / "model.json").write_text(json.dumps(asdict(replace(SMALL, spectral=True))))
+    return tmp_path, net
+
+
+def test_load_generator_returns_the_saved_one_in_evaluation_mode(run):
+    folder, net = run
+    for given in (folder, str(folder)):
+        loaded, config = load_generator(given)
+        assert config == replace(SMALL, spectral=True) and not loaded.training
+    meshes = [rand(1, 9, 3, dtype=torch.float32), rand(1, 8, 3, seed=1, dtype=torch.float32)]
+    extra = {f"{n}_descriptors": rand(1, v, 3).float() for n, v in (("identity", 9), ("pose", 8))}
+    assert torch.equal(loaded(*meshes, **extra).vertices, net.eval()(*meshes, **extra).vertices)
+
+
+def test_load_generator_without_descriptors(tmp_path):
+    """The empty statistics of the descriptors survive the file."""
+    config = replace(SMALL, descriptors="none")
+    save_file(config.build().state_dict(), tmp_path / "model.safetensors")
+    (tmp_path / "model.json").write_text(json.dumps(asdict(config)))
+    assert load_generator(tmp_path)[0].descriptor_mean.shape == (0,)
+
+
+@pytest.mark.parametrize("name", ["model.json", "model.safetensors"])
+def test_load_generator_names_the_missing_file(run, name):
+    (run[0] / name).unlink()
+    with pytest.raises(ValueError, match=f"holds no {name}: give the folder"):
+        load_generator(run[0])
+
+
+@pytest.mark.parametrize("kept", [0, 5, 400, -4])
+def test_load_generator_refuses_damaged_weights(run, kept):
+    file = run[0] / "model.safetensors"
+    file.write_bytes(file.read_bytes()[:kept])
+    with pytest.raises(ValueError, match="cannot be read into this model"):
+        load_generator(run[0])
+
+
+@pytest.mark.parametrize("change", [{"widths": (8, 6)}, {"widths": (8,)}, {"spectral": False}, {"num_signatures": 3}])
+def test_load_generator_refuses_weights_of_another_configuration(run, change):
+    (run[0] / "model.json").write_text(json.dumps(asdict(replace(SMALL, **{"spectral": True, **change}))))
+    with pytest.raises(ValueError, match="cannot be read into this model"):
+        load_generator(run[0])
+
+
+def test_load_generator_refuses_a_damaged_configuration(run):
+    (run[0] / "model.json").write_text('{"k": 3')
+    with pytest.raises(ValueError, match="not JSON"):
+        load_generator(run[0])
+
+
+def test_initialisation_of_the_linear_maps():
+    """Xavier normal, deviation sqrt(2 / (in + out)), on every map but the last."""
+    torch.manual_seed(0)
+    net = PoseTransferGenerator(extractor_widths=(64, 64), k=4, widths=(128, 128), spectral=False)
+    for name, parameter in net.named_parameters():
+        if parameter.dim() == 2 and "narrow.1" not in name and parameter.numel() > 2000:
+            expected = math.sqrt(2 / sum(parameter.shape))
+            assert parameter.std().item() == pytest.approx(expected, rel=0.1), name
+            # A normal deviate, not a uniform one, which ends at 1.7 deviations.
+            assert parameter.abs().amax().item() > 2.5 * expected, name
+    assert net.transfer.narrow[-1].weight.std().item() == pytest.approx(1e-3, rel=0.2)

@@ -1,0 +1,558 @@
+"""The X-DualNet recipe as a user runs it: what a run leaves, what a killed one resumes, what mistakes are answered."""
+
+import importlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import load_file
+from scipy.spatial import cKDTree
+
+from meshkit.data import MeshPool, PosePairs, human_split, load_humans
+from meshkit.io import load_mesh, save_mesh
+from meshkit.losses import edge_length_loss, edge_ratio_loss
+from meshkit.models import GeneratorConfig, load_generator
+
+pytest.importorskip("tyro")
+pytest.importorskip("lightning_fabric")
+
+ROOT = Path(__file__).parents[1]
+SCRIPT = ROOT / "recipes" / "xdualnet.py"
+STEPS, BATCH, EVAL_PAIRS = 8, 2, 4
+# The processor and full precision, so that runs repeat bit for bit wherever the tests run.
+TINY = (
+    "--threads 1 --accelerator cpu --precision 32-true --pool 6 --pairs 40 --points 64 --eval-every 4 --save-every 2 "
+    f"--batch {BATCH} --eval-pairs {EVAL_PAIRS} --model.widths 16 8 --model.extractor-widths 8 8 --model.k 6"
+).split()
+
+
+def command(*arguments: Any) -> list[str]:
+    return [sys.executable, str(SCRIPT), *map(str, arguments)]
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"OMP_NUM_THREADS": "1"}
+
+
+def launch(*arguments: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(*arguments), cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def read_log(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    return json.loads(file.read_text())
+
+
+@pytest.fixture(scope="module")
+def recipe() -> ModuleType:
+    sys.path.insert(0, str(SCRIPT.parent))
+    try:
+        return importlib.import_module("xdualnet")
+    finally:
+        sys.path.remove(str(SCRIPT.parent))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
+    """A whole run in the folder ``runs/whole`` of its own base folder, shared by the tests: they must not change it."""
+    out = tmp_path_factory.mktemp("finished")
+    run = launch("--out", out, "--name", "whole", "--steps", STEPS, *TINY)
+    assert run.returncode == 0, run.stderr
+    return run
+
+
+@pytest.fixture(scope="module")
+def whole(finished: subprocess.CompletedProcess[str]) -> Path:
+    arguments = finished.args
+    return Path(arguments[arguments.index("--out") + 1]) / "whole"
+
+
+@pytest.fixture
+def copied(whole: Path, tmp_path: Path) -> Path:
+    """A copy of the run without its pictures and meshes, to be damaged."""
+    folder = tmp_path / "copied"
+    folder.mkdir()
+    for file in whole.iterdir():
+        if file.is_file() and file.suffix != ".png":
+            (folder / file.name).write_bytes(file.read_bytes())
+    return folder
+
+
+@pytest.fixture
+def refuse(recipe: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Runs the recipe in this process with arguments that it must refuse: status 2 and one line, which is returned."""
+
+    def run(*arguments: Any) -> str:
+        monkeypatch.setattr(sys, "argv", ["xdualnet.py", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            recipe.guard(recipe.main)
+        assert caught.value.code == 2
+        # Progress bars rewrite their line; what is left on the screen besides them is the error, on a line of its own.
+        lines = [line for line in re.split(r"[\r\n]+", capsys.readouterr().err) if line and not line.endswith("]")]
+        assert len(lines) == 1, lines
+        assert lines[0].startswith("error: ")
+        return lines[0]
+
+    return run
+
+
+# What a run leaves
+
+
+def test_log_has_one_line_per_step(whole: Path) -> None:
+    records = read_log(whole)
+    assert [record["step"] for record in records] == list(range(1, STEPS + 1))
+    assert [record["step"] for record in records if "eval" in record] == [4]
+    for record in records:
+        terms = [record[name] for name in ("rec_a", "rec_b", "corr", "edge")]
+        assert all(np.isfinite(terms)) and min(terms) > 0
+        assert record["loss"] == pytest.approx(sum(terms), rel=1e-5)
+    seconds = [record["seconds"] for record in records]
+    assert seconds == sorted(seconds)
+
+
+def test_summary_holds_the_figures_of_the_run(whole: Path, finished: subprocess.CompletedProcess[str]) -> None:
+    summary = read_json(whole / "summary.json")
+    for name in ("", "_copy_identity", "_copy_warped"):
+        assert summary["test"][f"pmd{name}"] > 0
+        assert summary["test"][f"chamfer{name}"] > 0
+        assert f"{summary['test'][f'pmd{name}']:.2f}" in finished.stdout
+    assert summary["test"]["correspondence_m"] > 0
+    assert (summary["steps"], summary["pairs_seen"]) == (STEPS, STEPS * BATCH)
+    assert (summary["test_pairs"], summary["threads"]) == (EVAL_PAIRS, 1)
+    # Rounded to hundredths of a minute.
+    assert abs(summary["train_minutes"] - read_log(whole)[-1]["seconds"] / 60) < 0.006
+    assert 0 <= summary["share_of_time_waiting_for_data"] < 1
+    assert summary["machine"]["torch"] == torch.__version__
+    assert summary["machine"]["cores"] == os.cpu_count()
+    generator, _ = load_generator(whole)
+    assert summary["parameters"] == sum(p.numel() for p in generator.parameters())
+
+
+def test_figures_follow_from_the_saved_meshes(whole: Path) -> None:
+    """PMD and Chamfer by their definitions, from the first pairs' files."""
+    sums = dict.fromkeys(["pmd", "chamfer", "pmd_copy_identity", "chamfer_copy_identity"], 0.0)
+    for b in range(EVAL_PAIRS):
+        truth = load_mesh(whole / "meshes" / f"pair{b}_ground_truth.obj")[0].double().numpy()
+        for suffix, name in (("", "output"), ("_copy_identity", "identity")):
+            verts = load_mesh(whole / "meshes" / f"pair{b}_{name}.obj")[0].double().numpy()
+            verts = verts - (verts.min(0) + verts.max(0)) / 2
+            sums[f"pmd{suffix}"] += ((verts - truth) ** 2).mean()
+            there, back = cKDTree(truth).query(verts)[0], cKDTree(verts).query(truth)[0]
+            sums[f"chamfer{suffix}"] += (there**2).mean() + (back**2).mean()
+    figures = read_json(whole / "summary.json")["test"]
+    for name, total in sums.items():
+        assert figures[name] == pytest.approx(1e3 * total / EVAL_PAIRS, rel=1e-3), name
+
+
+def test_meshes_load(whole: Path) -> None:
+    files = sorted((whole / "meshes").iterdir())
+    kinds = ("ground_truth", "identity", "output", "pose")
+    assert [file.name for file in files] == [f"pair{b}_{kind}.obj" for b in range(6) for kind in kinds]
+    for file in files:
+        verts, faces = load_mesh(file)
+        assert (len(verts), len(faces)) == (1000, 1996)
+    identity, output = (load_mesh(whole / "meshes" / f"pair0_{name}.obj") for name in ("identity", "output"))
+    assert torch.equal(identity[1], output[1])
+
+
+def test_pictures_open(whole: Path) -> None:
+    for name in ("sheet.png", "curves.png"):
+        with Image.open(whole / name) as picture:
+            picture.load()
+            assert min(picture.size) > 200
+            assert len(picture.convert("RGB").getcolors(1 << 24)) > 20
+
+
+def test_no_half_written_files_remain(whole: Path) -> None:
+    names = {file.name for file in whole.iterdir()}
+    assert {"model.safetensors", "model.json", "config.json", "state.pt", "machine.json"} <= names
+    assert not {name for name in names if name.startswith(".")}
+
+
+def test_configuration_is_recorded(whole: Path, recipe: ModuleType) -> None:
+    config = read_json(whole / "config.json")
+    assert set(config) == {field.name for field in fields(recipe.Config)}
+    assert (config["steps"], config["batch"], config["points"], config["precision"]) == (STEPS, BATCH, 64, "32-true")
+    assert config["model"] == read_json(whole / "model.json")
+    assert config["model"]["widths"] == [16, 8]
+
+
+def test_training_shows_no_warnings(finished: subprocess.CompletedProcess[str]) -> None:
+    assert "Warning" not in finished.stderr
+
+
+# Resuming
+
+
+def test_a_killed_run_resumes_as_if_nothing_had_happened(whole: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    arguments = ("--out", tmp_path, "--name", "killed", "--steps", STEPS, *TINY)
+    with subprocess.Popen(
+        command(*arguments), cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        deadline = time.monotonic() + 120
+        while not (folder / "state.pt").exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    reached = torch.load(folder / "state.pt", weights_only=True)["step"]
+    assert 0 < reached < STEPS
+    assert not (folder / "summary.json").exists()
+    # What a kill can leave besides: a step logged after the checkpoint, and half a line.
+    with (folder / "log.jsonl").open("a") as stream:
+        stream.write(json.dumps(read_log(whole)[reached] | {"loss": -1.0}) + '\n{"step": ' + str(reached + 2))
+
+    run = launch("--resume", *arguments)
+    assert run.returncode == 0, run.stderr
+    ours, theirs = load_file(folder / "model.safetensors"), load_file(whole / "model.safetensors")
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    timeless = [[{k: v for k, v in r.items() if k != "seconds"} for r in read_log(f)] for f in (folder, whole)]
+    assert timeless[0] == timeless[1]
+    summaries = [read_json(f / "summary.json") for f in (folder, whole)]
+    assert summaries[0]["test"] == summaries[1]["test"]
+    assert summaries[0]["pairs_seen"] == summaries[1]["pairs_seen"]
+    configs = [read_json(f / "config.json") for f in (folder, whole)]
+    changed = {name for name in configs[0] if configs[0][name] != configs[1][name]}
+    assert changed <= {"name", "out", "resume"}
+
+
+@pytest.mark.parametrize("preset", ["tiny", "paper"])
+def test_the_recorded_configuration_is_the_one_resumed(recipe: ModuleType, preset: str) -> None:
+    begun = replace(recipe.PRESETS[preset], steps=77, seed=5, batch=3, arap_from=1.0, supervised=True)
+    recorded = json.loads(json.dumps(asdict(begun), default=str))
+    asked = replace(recipe.PRESETS["tiny"], name="other", out=Path("else"), resume=True, threads=1)
+    expected = replace(begun, name="other", out=Path("else"), resume=True, threads=1)
+    assert recipe.resumed(asked, recorded) == expected
+
+
+def test_an_existing_run_is_not_overwritten(whole: Path, refuse: Any) -> None:
+    before = {file: file.stat().st_mtime_ns for file in whole.rglob("*")}
+    line = refuse("--out", whole.parent, "--name", whole.name, "--steps", 1, *TINY[2:])
+    assert str(whole) in line and "--resume" in line
+    assert {file: file.stat().st_mtime_ns for file in whole.rglob("*")} == before
+
+
+@pytest.mark.parametrize("name", ["state.pt", "config.json", "pool_train.safetensors"])
+@pytest.mark.parametrize("damage", ["truncated", "empty"])
+def test_a_damaged_file_is_named(copied: Path, refuse: Any, name: str, damage: str) -> None:
+    content = (copied / name).read_bytes()
+    (copied / name).write_bytes(content[: len(content) // 2] if damage == "truncated" else b"")
+    line = refuse("--resume", "--out", copied.parent, "--name", copied.name, *TINY[2:])
+    assert str(copied / name) in line
+
+
+def test_a_pool_of_another_configuration_is_not_reused(recipe: ModuleType, tmp_path: Path) -> None:
+    """A run killed before its first checkpoint may be begun anew with other values."""
+    cfg = replace(recipe.PRESETS["tiny"], pool=3, eval_pairs=1)
+    run = recipe.Run(tmp_path, resume=False)
+    recipe.data(cfg, run, workers=1)
+    model = replace(cfg.model, num_signatures=4)
+    pairs, _ = recipe.data(replace(cfg, seed=1, model=model), recipe.Run(tmp_path, resume=False), workers=1)
+    split = human_split()
+    fresh = MeshPool.build(
+        load_humans(), split.train_identities, split.train_poses, 3, num_signatures=4, num_eigenpairs=5, seed=1
+    )
+    assert torch.equal(pairs.pool.identity, fresh.identity)
+    assert pairs.pool.descriptors.shape == fresh.descriptors.shape
+
+
+@pytest.fixture
+def diverging(copied: Path) -> list[Any]:
+    """Arguments of a run whose first update is absurd; it saves a checkpoint at every step."""
+    for name in ("state.pt", "config.json", "log.jsonl"):
+        (copied / name).unlink()
+    wild = ("--steps", STEPS, "--lr", 1e30, "--warmup", 0, "--save-every", 1)
+    return ["--out", copied.parent, "--name", copied.name, *TINY[2:], *wild]
+
+
+def test_divergence_is_told_in_one_line(diverging: list[Any], refuse: Any) -> None:
+    line = refuse(*diverging)
+    assert "the loss is" in line and "step 1" in line
+
+
+def test_advice_on_divergence_works(
+    recipe: ModuleType, copied: Path, diverging: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["xdualnet.py", *map(str, diverging)])
+    with pytest.raises(recipe.UserError) as caught:
+        recipe.main()
+    advice = str(caught.value)
+    if "checkpoint is sound" in advice:
+        state = torch.load(copied / "state.pt", weights_only=True)
+        assert all(value.abs().max() < 1e6 for value in state["model"].values())
+    if "resume" in advice and "--lr" in advice:
+        asked = replace(recipe.PRESETS["tiny"], lr=1e-5, resume=True)
+        assert recipe.resumed(asked, read_json(copied / "config.json")).lr == 1e-5
+
+
+def test_measuring_the_speed_leaves_no_trace(recipe: ModuleType, small: Any) -> None:
+    cfg, _ = small
+    cfg = replace(cfg, minutes=2.0, warmup=0)
+    split = human_split()
+    pairs = PosePairs(load_humans(), split.train_identities, split.train_poses, length=20)
+    fabric = recipe.Fabric(accelerator="cpu", devices=1)
+    generator, system = recipe.build(cfg)
+    system, optimizer = fabric.setup(system, torch.optim.Adam(generator.parameters()))
+    weights = {name: value.clone() for name, value in generator.state_dict().items()}
+    loader = recipe.pair_loader(pairs, recipe.PairSampler(20, 2, stop=5))
+    steps = recipe.count_steps(cfg, fabric, system, optimizer, loader)
+    assert 10 < steps < 1_000_000
+    assert all(torch.equal(value, weights[name]) for name, value in generator.state_dict().items())
+    assert optimizer.state_dict()["state"] == {}
+    assert recipe.count_steps(replace(cfg, steps=7), fabric, system, optimizer, loader) == 7
+
+
+# Other ways to run
+
+
+def test_supervised_training_for_a_time_without_descriptors(tmp_path: Path) -> None:
+    without_descriptors = ("--model.descriptors", "none", "--model.condition", "features")
+    run = launch("--out", tmp_path, "--name", "s", "--supervised", "--minutes", 0.02, *TINY, *without_descriptors)
+    assert run.returncode == 0, run.stderr
+    steps = read_json(tmp_path / "s" / "config.json")["steps"]
+    assert steps >= 1
+    records = read_log(tmp_path / "s")
+    assert [record["step"] for record in records] == list(range(1, steps + 1))
+    assert set(records[0]) - {"step", "seconds", "eval"} == {"rec", "edge", "loss"}
+    summary = read_json(tmp_path / "s" / "summary.json")
+    assert (summary["steps"], summary["pairs_seen"]) == (steps, steps * BATCH)
+    # Within a factor of the speed measured at the start; machines are not that steady.
+    assert records[-1]["seconds"] < 10 * 0.02 * 60
+    assert not list((tmp_path / "s").glob("pool_*"))
+    assert load_generator(tmp_path / "s")[1].descriptors == "none"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Mesh files, good and bad."""
+    folder = tmp_path_factory.mktemp("meshes")
+    body, other = load_humans(2000), load_humans(1000)
+    save_mesh(folder / "identity.obj", 3 + body(torch.tensor([190]), torch.tensor([0]))[0], body.faces)
+    save_mesh(folder / "pose.ply", other(torch.tensor([191]), torch.tensor([5]))[0], other.faces)
+    text = (folder / "identity.obj").read_text().splitlines()
+    (folder / "nan.obj").write_text("\n".join(["v nan 0 0", *text[1:]]))
+    (folder / "points.obj").write_text("\n".join(line for line in text if line.startswith("v")))
+    (folder / "single.obj").write_text("v 0 0 0\nf 1 1 1\n")
+    (folder / "loose.obj").write_text("\n".join([*text, "v 0 0 0"]))
+    (folder / "text.obj").write_text("not a mesh")
+    return folder
+
+
+def test_pose_transfer_between_files_of_different_sizes(whole: Path, files: Path, tmp_path: Path) -> None:
+    result = tmp_path / "new" / "posed.obj"
+    pair = (files / "identity.obj", files / "pose.ply")
+    run = launch("--out", whole.parent, "--name", whole.name, "--apply", *pair, "--result", result)
+    assert run.returncode == 0, run.stderr
+    verts, faces = load_mesh(result)
+    assert verts.shape == (2000, 3)
+    assert torch.equal(faces, load_mesh(pair[0])[1])
+    assert verts.std(0).min() > 0
+    assert str(result) in run.stdout
+
+
+def test_transfer_ignores_where_the_meshes_stand(recipe: ModuleType, whole: Path, files: Path, tmp_path: Path) -> None:
+    verts, faces = load_mesh(files / "identity.obj")
+    save_mesh(tmp_path / "moved.obj", verts + torch.tensor([8.0, -4, 2]), faces)
+    cfg = replace(recipe.PRESETS["tiny"], out=whole.parent, name=whole.name)
+    results = []
+    for name, file in (("a", files / "identity.obj"), ("b", tmp_path / "moved.obj")):
+        result = tmp_path / f"{name}.obj"
+        recipe.apply(replace(cfg, apply=(file, files / "pose.ply"), result=result))
+        results.append(load_mesh(result)[0])
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        ("missing.obj", "no such file"),
+        ("nan.obj", "NaN"),
+        ("single.obj", "3 vertices or more"),
+        ("points.obj", "no faces"),
+        ("loose.obj", "1 of 2001 vertices"),
+        ("text.obj", "line 1|no vertices"),
+    ],
+)
+@pytest.mark.parametrize("place", [0, 1])
+def test_bad_meshes_are_named(
+    whole: Path, files: Path, tmp_path: Path, refuse: Any, bad: str, said: str, place: int
+) -> None:
+    pair = [files / "identity.obj", files / "pose.ply"]
+    pair[place] = files / bad
+    result = tmp_path / "posed.obj"
+    line = refuse("--out", whole.parent, "--name", whole.name, "--apply", *pair, "--result", result)
+    assert str(files / bad) in line
+    assert any(part in line for part in said.split("|"))
+    assert not result.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "result", "said"),
+    [
+        ("nobody", "posed.obj", "nobody holds no model.json"),
+        ("whole", "posed.txt", "cannot be written"),
+        ("whole", "file/posed.obj", "cannot write"),
+    ],
+)
+def test_transfer_without_weights_or_a_place_to_write(
+    whole: Path, files: Path, tmp_path: Path, refuse: Any, name: str, result: str, said: str
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    pair = (files / "identity.obj", files / "pose.ply")
+    line = refuse("--out", whole.parent, "--name", name, "--apply", *pair, "--result", tmp_path / result)
+    assert said in line
+
+
+def test_an_unwritable_folder_ends_with_one_line(tmp_path: Path) -> None:
+    """A folder below a file: nobody can write there, not even root."""
+    (tmp_path / "file").write_text("in the way")
+    run = launch("--out", tmp_path / "file" / "runs", "--steps", 1, *TINY)
+    assert run.returncode == 2
+    assert run.stderr.startswith(f"error: cannot write to {tmp_path / 'file' / 'runs'}")
+    assert "--out" in run.stderr
+    assert len(run.stderr.splitlines()) == 1
+    assert run.stdout == ""
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        ("--steps", "0"),
+        ("--minutes", "-1"),
+        ("--batch", "0"),
+        ("--batch", "41"),
+        ("--pool", "1"),
+        ("--points", "0"),
+        ("--model.descriptors", "hks"),
+        ("--accelerator", "abacus"),
+    ],
+    ids=" ".join,
+)
+def test_impossible_values_are_refused_in_one_line(copied: Path, refuse: Any, mistake: tuple[str, str]) -> None:
+    for name in ("state.pt", "config.json"):
+        (copied / name).unlink()
+    steps = () if mistake[0] in ("--steps", "--minutes") else ("--steps", 1)
+    line = refuse("--out", copied.parent, "--name", copied.name, *steps, *TINY[2:], *mistake)
+    assert mistake[1] in line
+
+
+# Presets, schedule, losses
+
+
+def test_help_gives_the_paper_values(
+    recipe: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["xdualnet.py", "--help"])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as caught:
+        recipe.main()
+    assert not caught.value.code
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for said in ("Paper: 6890", "Paper: 1e-4", "Paper: 2000", "Paper: 200 epochs of 1600", "Paper: 50", "Paper: 0.1"):
+        assert said in text, said
+    for flag in ("--resume", "--apply", "--supervised", "--preset", "--minutes", "--model.widths"):
+        assert flag in text
+
+
+def test_paper_preset_is_the_printed_setting(recipe: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    cfg = recipe.PRESETS["paper"]
+    assert (cfg.vertices, cfg.points, cfg.pairs, cfg.batch) == (6890, None, 6400, 4)
+    assert cfg.steps == 320_000 == 200 * cfg.pairs // cfg.batch
+    assert cfg.model.widths == (1024, 512, 256)
+    assert cfg.model.extractor_widths == (32, 64, 128)
+    assert (cfg.model.eps, cfg.model.n_iters, cfg.model.descriptors) == (0.03, 5, "none")
+    assert (cfg.lambda_rec, cfg.lambda_corr, cfg.lambda_edge) == (2000, 200, 1)
+    assert (cfg.arap_from, cfg.arap_fraction, cfg.arap_iters, cfg.arap_energy) == (0.75, 0.1, 50, "spokes")
+    assert (cfg.lr, cfg.warmup, cfg.decay_from) == (1e-4, 0, 0.5)
+    assert (cfg.resample, cfg.eval_pairs, cfg.supervised) == (False, 400, False)
+    # The command line gives the same, and single values can be changed.
+    parsed = []
+    monkeypatch.setattr(recipe, "train", parsed.append)
+    for arguments in (["--preset", "paper"], ["--preset=paper"], ["--batch", "6", "--preset", "paper"], []):
+        monkeypatch.setattr(sys, "argv", ["xdualnet.py", *arguments])
+        recipe.main()
+    assert parsed == [cfg, cfg, replace(cfg, batch=6), recipe.PRESETS["tiny"]]
+
+
+def test_learning_rate_schedule(recipe: ModuleType) -> None:
+    paper, steps = recipe.PRESETS["paper"], 320_000
+    for epoch in range(200):  # flat for 100 epochs, then 1e-6 less each epoch
+        expected = 1e-4 if epoch <= 100 else 1e-4 - 1e-6 * (epoch - 100)
+        assert recipe.learning_rate(paper, 1600 * epoch, steps) == pytest.approx(expected)
+    tiny = replace(paper, warmup=50, lr=1e-3)
+    rates = [recipe.learning_rate(tiny, s, 1000) for s in range(1000)]
+    assert rates[0] == pytest.approx(1e-3 / 50)
+    assert rates[:50] == pytest.approx([1e-3 * (s + 1) / 50 for s in range(50)])
+    assert rates[50:500] == pytest.approx([1e-3] * 450)
+    assert rates[-1] == pytest.approx(1e-3 * 2 / 1000)
+    assert recipe.learning_rate(replace(tiny, decay_from=1.0), 999, 1000) == pytest.approx(1e-3)
+
+
+@pytest.fixture
+def small(recipe: ModuleType) -> Any:
+    """A configuration without descriptors, and a batch for it."""
+    model = GeneratorConfig(widths=(8, 8), extractor_widths=(8, 8), k=4)
+    cfg = replace(recipe.PRESETS["tiny"], model=model, points=32)
+    split = human_split()
+    return cfg, PosePairs(load_humans(), split.train_identities, split.train_poses)[[(0, 0), (0, 1)]]
+
+
+def run_step(recipe: ModuleType, cfg: Any, batch: Any, *, arap: bool = False) -> dict[str, float]:
+    torch.manual_seed(0)
+    _, system = recipe.build(cfg)
+    torch.manual_seed(1)
+    return {name: float(value.detach()) for name, value in recipe.step(system, batch, cfg, arap=arap).items()}
+
+
+def test_weights_scale_their_losses(recipe: ModuleType, small: Any) -> None:
+    cfg, batch = small
+    losses = run_step(recipe, cfg, batch)
+    assert set(losses) == {"rec_a", "rec_b", "corr", "edge"}
+    for flag, names in (("rec", {"rec_a", "rec_b"}), ("corr", {"corr"}), ("edge", {"edge"})):
+        changed = run_step(recipe, replace(cfg, **{f"lambda_{flag}": 3 * getattr(cfg, f"lambda_{flag}")}), batch)
+        for name, value in losses.items():
+            assert changed[name] == pytest.approx((3 if name in names else 1) * value, rel=1e-5), (flag, name)
+
+
+def test_deformer_changes_the_reconstructions_only(recipe: ModuleType, small: Any) -> None:
+    cfg, batch = small
+    without, joined = run_step(recipe, cfg, batch), run_step(recipe, cfg, batch, arap=True)
+    assert joined["rec_a"] != pytest.approx(without["rec_a"], rel=1e-6)
+    assert joined["edge"] == pytest.approx(without["edge"], rel=1e-5)  # it acts on the output before the deformer
+
+
+@pytest.mark.parametrize("edge", ["ratio", "length"])
+def test_supervised_losses_compare_with_the_truth(recipe: ModuleType, small: Any, edge: str) -> None:
+    cfg, batch = small
+    cfg = replace(cfg, supervised=True, edge=edge)
+    losses = run_step(recipe, cfg, batch)
+    torch.manual_seed(0)
+    generator, _ = recipe.build(cfg)
+    torch.manual_seed(1)
+    output = generator(batch.identity, batch.pose).vertices.detach()
+    expected = cfg.lambda_rec * (output - batch.ground_truth).double().square().mean((1, 2)).mean()
+    assert losses["rec"] == pytest.approx(float(expected), rel=1e-4)
+    if edge == "ratio":
+        penalty = edge_ratio_loss(output, batch.identity, batch.identity_faces)
+    else:
+        penalty = edge_length_loss(output, batch.identity_faces, reduction="sum")
+    assert losses["edge"] == pytest.approx(cfg.lambda_edge * float(penalty), rel=1e-4)
