@@ -13,7 +13,7 @@ help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(READY) ## train X-DualNet for about eight minutes on the shipped bodies and draw the results
-	$(BIN)/python recipes/xdualnet.py --name demo --minutes 8
+	$(BIN)/python recipes/xdualnet.py --name demo --minutes 8 --resume
 	@echo "Pictures: $(CURDIR)/runs/demo"; ls runs/demo/*.png
 
 test: lint ## lint, then run every test and docstring example

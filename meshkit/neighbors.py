@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from meshkit.batching import check_mask
+
 __all__ = ["gather_vertices", "knn"]
 
 _TILE_ELEMENTS = 1 << 22  # distances held at once by the tiled search: 16 MiB in float32
@@ -51,14 +53,16 @@ def knn(
         raise ValueError(f"query must have shape (B, Q, C) like points {tuple(points.shape)}, got {tuple(query.shape)}")
     if method not in ("auto", "tree", "tiles"):
         raise ValueError(f'method must be "auto", "tree" or "tiles", got {method!r}')
+    check_mask(mask, *points.shape[:2])
     fewest = points.shape[1] if mask is None else int(mask.sum(1).min()) if len(mask) else 0
     if not 1 <= k <= fewest:
         raise ValueError(
             f"k={k} neighbours were asked for, but the smallest mesh of the batch has {fewest} vertices: "
             "use a smaller k or a larger mesh"
         )
-    points = points.detach()
-    query = points if query is None else query.detach()
+    dtype = torch.promote_types(points.dtype, torch.float32)
+    points = points.detach().to(dtype)
+    query = points if query is None else query.detach().to(dtype)
     if method == "auto":
         method = "tree" if points.device.type == "cpu" else "tiles"
     search = _knn_tree if method == "tree" else _knn_tiles
@@ -84,11 +88,14 @@ def _knn_tree(points: Tensor, query: Tensor, k: int, mask: Tensor | None) -> Ten
 
 def _knn_tiles(points: Tensor, query: Tensor, k: int, mask: Tensor | None) -> Tensor:
     batch, num = points.shape[:2]
+    far = torch.finfo(points.dtype).max
     step = max(1, _TILE_ELEMENTS // (batch * num))
     rows = []
     for start in range(0, query.shape[1], step):
         # The direct form keeps tiny distances exact, where |a|^2 - 2ab + |b|^2 would lose them.
         tile = torch.cdist(query[:, start : start + step], points, compute_mode="donot_use_mm_for_euclid_dist")
+        # As in the tree, what is not finite is far away, but nearer than padding.
+        tile = torch.nan_to_num(tile, nan=far, posinf=far)
         if mask is not None:
             tile = tile.masked_fill(~mask[:, None], torch.inf)
         rows.append(tile.topk(k, dim=2, largest=False).indices)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -29,6 +30,9 @@ def guard(main: Any, *arguments: Any) -> None:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+    except OSError as error:
+        print(f"error: {error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
+        raise SystemExit(2) from None
     except KeyboardInterrupt:
         print("\ninterrupted: what the last checkpoint holds is kept; --resume goes on from there", file=sys.stderr)
         raise SystemExit(130) from None
@@ -37,21 +41,21 @@ def guard(main: Any, *arguments: Any) -> None:
 class Run:
     """The folder of a run: ``config.json``, ``state.pt``, ``model.safetensors``, ``model.json``, ``log.jsonl``.
 
-    ``state.pt`` alone is enough to resume. Every file but the log is replaced whole; the log is cut back to the step
-    that a resumed run starts from.
+    ``state.pt`` and ``config.json`` are what a resumed run needs. Every file but the log is replaced whole; the log is
+    cut back to the step that a resumed run starts from.
     """
 
     def __init__(self, folder: Path, *, resume: bool) -> None:
         self.folder = folder
         self.log_file = folder / "log.jsonl"
+        if (folder / "state.pt").exists() and not resume:
+            raise UserError(f"{folder} holds a run already: go on with --resume, or choose another --name")
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with atomic_write(folder / "machine.json") as path:
                 path.write_text(json.dumps(machine(), indent=2))
         except OSError as error:
             raise UserError(f"cannot write to {folder}: {error.strerror}. Choose another folder with --out") from None
-        if (folder / "state.pt").exists() and not resume:
-            raise UserError(f"{folder} holds a run already: go on with --resume, or choose another --name")
 
     def path(self, name: str) -> Path:
         return self.folder / name
@@ -67,14 +71,21 @@ class Run:
         except ValueError:
             raise UserError(f"{path} is damaged: delete {self.folder} or choose another --name") from None
 
-    def save_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
+    def save_tensors(self, name: str, tensors: dict[str, Tensor], made_from: str = "") -> None:
         with atomic_write(self.folder / name) as path:
-            save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, path)
+            values = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
+            save_file(values, path, metadata={"made_from": made_from})
 
-    def load_tensors(self, name: str) -> dict[str, Tensor] | None:
+    def load_tensors(self, name: str, made_from: str = "") -> dict[str, Tensor] | None:
+        """The tensors saved under ``name``, or ``None`` if there are none made from the same things."""
         path = self.folder / name
+        if not path.exists():
+            return None
         try:
-            return load_file(path) if path.exists() else None
+            with safe_open(path, framework="pt") as file:
+                if (file.metadata() or {}).get("made_from") != made_from:
+                    return None
+            return load_file(path)
         except Exception:
             raise UserError(f"{path} is damaged: delete it and start again") from None
 
@@ -89,7 +100,8 @@ class Run:
         if not path.exists():
             return None
         try:
-            return dict(torch.load(path, map_location="cpu", weights_only=True))
+            state = dict(torch.load(path, map_location="cpu", weights_only=True))
+            return {key: state[key] for key in ("model", "optimizer", "step", "seconds", "waiting")}
         except Exception:
             raise UserError(
                 f"{path} is not a readable checkpoint: delete {self.folder} or choose another --name"

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 import sys
 import time
 from dataclasses import asdict, dataclass, field, replace
@@ -20,27 +21,19 @@ from typing import Any, Literal, cast
 
 import torch
 import tyro
+from _apply import apply
+from _report import evaluate, report
 from _run import Run, UserError, guard, keep_freed_memory, pick_precision
 from lightning_fabric import Fabric
 from torch import Tensor
 from tqdm import tqdm
 
-from meshkit.batching import bounding_box_center, center
 from meshkit.consistency import DualReconstruction
 from meshkit.data import MeshPool, PairBatch, PairSampler, PosePairs, human_split, load_humans, pair_loader
 from meshkit.deform import ARAPDeformer
-from meshkit.descriptors import intrinsic_descriptors
-from meshkit.io import MeshFileError, load_mesh, save_mesh
-from meshkit.losses import (
-    backward_correspondence_loss,
-    edge_length_loss,
-    edge_ratio_loss,
-    reconstruction_loss,
-)
-from meshkit.metrics import chamfer_distance, correspondence_error, pmd
-from meshkit.models import GeneratorConfig, PoseTransferGenerator, load_generator
+from meshkit.losses import backward_correspondence_loss, edge_length_loss, edge_ratio_loss, reconstruction_loss
+from meshkit.models import GeneratorConfig, PoseTransferGenerator
 from meshkit.models.presets import PRESETS as MODELS
-from meshkit.viz import contact_sheet, error_colors, plot_curves, render
 
 
 @dataclass(frozen=True)
@@ -54,7 +47,8 @@ class Config:
     out: Path = Path("runs")
     """Folder that holds the runs."""
     resume: bool = False
-    """Go on from the run's last checkpoint, if it has one."""
+    """Go on from the run's last checkpoint, if it has one, with the settings it was begun with: of the other flags only
+    --out, --name, --threads and --accelerator count then."""
     apply: tuple[Path, Path] | None = None
     """Do not train: give the first mesh file the pose of the second, with the weights of run --name."""
     result: Path = Path("posed.obj")
@@ -144,7 +138,7 @@ PRESETS = {
         betas=(0.0, 0.9),
         adam_eps=1e-3,
         warmup=0,
-        corr_normalization="rows",
+        corr_normalization="rows",  # as released; the printed raw plan shrinks the mesh N times. Likewise the edge loss
         arap_iters=50,
         arap_energy="spokes",
         arap_grad="none",
@@ -177,9 +171,7 @@ def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, *, arap: bool) 
         # O = G(A, B);  Ô = ARAP(A, O);  A' = G(Ô, A) ≈ A;  B' = G(B, Ô) ≈ B
         result = system(batch.identity, batch.pose, identity_faces=batch.identity_faces, use_deform=arap, **descriptors)
         output = result.output
-        back = backward_correspondence_loss(
-            result.plan, result.target_b, warped=result.warped, normalization=cfg.corr_normalization
-        )
+        back = backward_correspondence_loss(result.plan, result.target_b, normalization=cfg.corr_normalization)
         losses = {
             "rec_a": cfg.lambda_rec * reconstruction_loss(result.reconstruction_a, result.target_a),
             "rec_b": cfg.lambda_rec * reconstruction_loss(result.reconstruction_b, result.target_b),
@@ -206,82 +198,61 @@ def train_step(
     torch.manual_seed(cfg.seed * 1_000_003 + s * 7919 + fabric.global_rank)
     for group in optimizer.param_groups:
         group["lr"] = learning_rate(cfg, s, steps)
-    losses = step(system, batch, cfg, arap=s >= cfg.arap_from * steps)
+    where = f"at step {s} (identities {batch.identity_index.tolist()}, poses {batch.pose_index.tolist()})"
+    advice = "training has diverged. Begin again under another --name with a smaller --lr"
+    try:
+        losses = step(system, batch, cfg, arap=s >= cfg.arap_from * steps)
+    except ValueError as error:
+        raise UserError(f"{error} {where}: {advice}") from None
     total = torch.stack(list(losses.values())).sum()
-    if not torch.isfinite(total):
-        raise UserError(
-            f"the loss is {float(total)} at step {s} (identities {batch.identity_index.tolist()}, poses "
-            f"{batch.pose_index.tolist()}): the last checkpoint is sound; resume it with a smaller --lr"
-        )
     optimizer.zero_grad()
     fabric.backward(total)
+    # Weights that turn NaN would be saved; they are looked at before, not after, the update.
+    norm = torch.nn.utils.get_total_norm(p.grad for p in system.parameters() if p.grad is not None)
+    if not torch.isfinite(total + norm):
+        raise UserError(f"the loss is {total.item()}, its gradient {norm.item()} {where}: {advice}")
     optimizer.step()
     return {name: value.item() for name, value in losses.items()} | {"loss": total.item()}
-
-
-@torch.no_grad()
-def evaluate(generator: PoseTransferGenerator, pairs: PosePairs, device: torch.device, count: int) -> dict[str, float]:
-    """Means over ``count`` unseen pairs, of the output and of two baselines; PMD and Chamfer in 1e-3 square metres."""
-    generator.eval()
-    columns: dict[str, list[Tensor]] = {}
-    for start in range(0, count, 4):
-        batch = pairs[[(0, i) for i in range(start, min(start + 4, count))]].to(device)
-        result = generate(generator, batch)
-        candidates = {"": result.vertices, "_copy_identity": batch.identity, "_copy_warped": result.warped}
-        for name, verts in candidates.items():
-            columns.setdefault(f"pmd{name}", []).append(1e3 * pmd(verts, batch.ground_truth))
-            columns.setdefault(f"chamfer{name}", []).append(1e3 * chamfer_distance(center(verts), batch.ground_truth))
-        matched = correspondence_error(result.plan.argmax(), batch.pose, batch.correspondence)
-        columns.setdefault("correspondence_m", []).append(matched)
-    generator.train()
-    return {name: round(float(torch.cat(values).mean()), 4) for name, values in columns.items()}
-
-
-def generate(generator: PoseTransferGenerator, batch: PairBatch) -> Any:
-    return generator(
-        batch.identity,
-        batch.pose,
-        identity_descriptors=batch.identity_descriptors,
-        pose_descriptors=batch.pose_descriptors,
-    )
 
 
 def data(cfg: Config, run: Run, workers: int) -> tuple[PosePairs, PosePairs]:
     """Training pairs, and test pairs of unseen identities in unseen poses."""
     body, split = load_humans(cfg.vertices), human_split()
-    sides = {
-        "train": (split.train_identities, split.train_poses, cfg.pool, cfg.seed),
-        "test": (split.test_identities, split.test_poses, max(cfg.eval_pairs, 24), 1_000_000),
-    }
-    pairs = []
-    for side, (identities, poses, size, seed) in sides.items():
-        pool = None
-        if cfg.model.descriptors == "wks":
-            stored = run.load_tensors(f"pool_{side}.safetensors")
-            if stored is not None and len(stored["identity"]) == size:
-                pool = MeshPool(**stored)
-            else:
-                pool = MeshPool.build(
-                    body,
-                    identities,
-                    poses,
-                    size,
-                    num_signatures=cfg.model.num_signatures,
-                    seed=seed,
-                    workers=workers,
-                    progress=True,
-                )
-                run.save_tensors(f"pool_{side}.safetensors", pool.state_dict())
-        pairs.append(PosePairs(body, identities, poses, length=cfg.pairs, seed=seed, resample=cfg.resample, pool=pool))
-    return pairs[0], pairs[1]
+    listed = split.test_pairs[: cfg.eval_pairs]
+    pools: dict[str, MeshPool | None] = {"train": None, "test": None}
+    if cfg.model.descriptors == "wks":
+        shared: dict[str, Any] = {"num_signatures": cfg.model.num_signatures, "workers": workers, "progress": True}
+        who, how = listed.view(-1, 2).unbind(1)
+        make = {
+            "train": lambda: MeshPool.build(
+                body, split.train_identities, split.train_poses, cfg.pool, seed=cfg.seed, **shared
+            ),
+            "test": lambda: MeshPool.of(body, who, how, **shared),
+        }
+        for side in pools:
+            key = f"{side}, {cfg.vertices} vertices, {cfg.model.num_signatures} signatures, "
+            key += f"pool {cfg.pool}, seed {cfg.seed}" if side == "train" else f"{len(listed)} pairs"
+            stored = run.load_tensors(f"pool_{side}.safetensors", key)
+            pool = make[side]() if stored is None else MeshPool(**stored)
+            run.save_tensors(f"pool_{side}.safetensors", pool.state_dict(), key)
+            pools[side] = pool
+    train = PosePairs(
+        body,
+        split.train_identities,
+        split.train_poses,
+        length=cfg.pairs,
+        seed=cfg.seed,
+        resample=cfg.resample,
+        pool=pools["train"],
+    )
+    return train, PosePairs(body, split.test_identities, split.test_poses, pool=pools["test"], listed=listed)
 
 
 def count_steps(cfg: Config, fabric: Fabric, system: Any, optimizer: Any, loader: Any) -> int:
     """Steps that fit into ``cfg.minutes``, from the speed of a few steps on copies that are thrown away."""
     if cfg.steps is not None:
         return cfg.steps
-    if cfg.minutes is None or cfg.minutes <= 0:
-        raise UserError(f"give --steps, or positive --minutes, got {cfg.minutes}")
+    assert cfg.minutes is not None
     weights, moments = copy.deepcopy(system.state_dict()), copy.deepcopy(optimizer.state_dict())
     seconds = []
     for arap in (False, True):
@@ -303,21 +274,26 @@ def train(cfg: Config) -> None:
     keep_freed_memory()
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
-    torch.manual_seed(cfg.seed)
+    check(cfg)
     run = Run(cfg.out / cfg.name, resume=cfg.resume)
+    state = run.load_state() if cfg.resume else None
     recorded = run.load_json("config.json") if cfg.resume else None
     if recorded is not None:
         cfg = resumed(cfg, recorded)
-    elif cfg.precision == "auto":
-        device = Fabric(accelerator=cfg.accelerator, devices=1).device
-        cfg = replace(cfg, precision=pick_precision(device))
-    fabric = Fabric(accelerator=cfg.accelerator, devices=1, precision=cast(Any, cfg.precision))
-    train_pairs, test_pairs = data(cfg, run, workers=torch.get_num_threads())
-
-    generator, system = build(cfg)
+    elif state is not None:
+        raise UserError(f"{run.path('config.json')} is missing: without it the run cannot go on as it was begun")
+    try:
+        if cfg.precision == "auto":
+            device = Fabric(accelerator=cfg.accelerator, devices=1).device
+            cfg = replace(cfg, precision=pick_precision(device))
+        fabric = Fabric(accelerator=cfg.accelerator, devices=1, precision=cast(Any, cfg.precision))
+        torch.manual_seed(cfg.seed)
+        generator, system = build(cfg)
+        train_pairs, test_pairs = data(cfg, run, workers=torch.get_num_threads())
+    except (ValueError, RuntimeError) as error:
+        raise UserError(str(error)) from None
     if train_pairs.pool is not None:
-        generator.descriptor_mean.copy_(train_pairs.pool.descriptors.mean((0, 1)))
-        generator.descriptor_std.copy_(train_pairs.pool.descriptors.std((0, 1)))
+        generator.fit_descriptors(train_pairs.pool.descriptors)
     optimizer = torch.optim.Adam(generator.parameters(), lr=cfg.lr, betas=cfg.betas, eps=cfg.adam_eps)
     system, optimizer = fabric.setup(system, optimizer)
 
@@ -330,7 +306,6 @@ def train(cfg: Config) -> None:
     run.save_json("model.json", asdict(cfg.model))
 
     first, seconds, waiting = 0, 0.0, 0.0
-    state = run.load_state() if cfg.resume else None
     if state is not None:
         generator.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
@@ -340,157 +315,67 @@ def train(cfg: Config) -> None:
         run.cut_log(-1)
 
     clock = time.perf_counter()
-    bar = tqdm(total=steps, initial=first, unit="step", dynamic_ncols=True, smoothing=0.05)
     batches = iter(loader(first, steps))
-    for s in range(first, steps):
+    bar = tqdm(range(first, steps), total=steps, initial=first, unit="step", dynamic_ncols=True, smoothing=0.05)
+    for s in bar:
         asked = time.perf_counter()
         batch = next(batches).to(fabric.device)
         waiting += time.perf_counter() - asked
         losses = train_step(fabric, system, optimizer, batch, cfg, s, steps)
         seconds, clock = seconds + time.perf_counter() - clock, time.perf_counter()
-        bar.update()
         bar.set_postfix({name: f"{value:.3g}" for name, value in losses.items()}, refresh=False)
         record: dict[str, Any] = {"step": s + 1, "seconds": round(seconds, 2), **losses}
         if (s + 1) % cfg.eval_every == 0 and s + 1 < steps:
-            record["eval"] = evaluate(generator, test_pairs, fabric.device, 24)
-            bar.write(f"step {s + 1}: PMD {record['eval']['pmd']:.2f}e-3 on 24 unseen pairs")
+            few = min(24, len(test_pairs))
+            record["eval"] = evaluate(generator, test_pairs, fabric.device, few)
+            bar.write(f"step {s + 1}: PMD {record['eval']['pmd']:.2f}e-3 on {few} unseen pairs")
         run.log(**record)
         if (s + 1) % cfg.save_every == 0 or s + 1 == steps:
             run.save_state(generator, optimizer, s + 1, {"seconds": seconds, "waiting": waiting})
         clock = time.perf_counter()
-    bar.close()
-    report(cfg, run, generator, test_pairs, fabric.device, seconds, waiting)
+    report(
+        run,
+        generator,
+        test_pairs,
+        fabric.device,
+        {
+            "steps": steps,
+            "pairs_seen": steps * cfg.batch,
+            "train_minutes": round(seconds / 60, 2),
+            "share_of_time_waiting_for_data": round(waiting / max(seconds, 1e-9), 4),
+        },
+    )
+
+
+def check(cfg: Config) -> None:
+    """Refuse values that make no sense before anything is written."""
+    counts = ("steps", "batch", "pairs", "points", "pool", "arap_iters", "eval_pairs", "eval_every", "save_every")
+    for name in counts:
+        value = getattr(cfg, name)
+        if value is not None and value < 1:
+            raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+    if cfg.steps is None and (cfg.minutes is None or cfg.minutes <= 0):
+        raise UserError(f"give --steps, or positive --minutes, got {cfg.minutes}")
+    if cfg.batch > cfg.pairs:
+        raise UserError(f"--batch {cfg.batch} is more than the --pairs {cfg.pairs} of an epoch")
+    if cfg.eval_pairs > 400:
+        raise UserError(f"there are 400 test pairs, --eval-pairs asks for {cfg.eval_pairs}")
+    if not 0 <= cfg.decay_from <= 1 or not 0 <= cfg.arap_from <= 1:
+        raise UserError(f"--decay-from and --arap-from are shares, got {cfg.decay_from} and {cfg.arap_from}")
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise UserError("this recipe trains in one process: start it with python, not torchrun")
 
 
 def resumed(cfg: Config, recorded: dict[str, Any]) -> Config:
     """The recorded configuration: a run that goes on must be the run that was begun."""
-    model = GeneratorConfig.from_json(json.dumps(recorded.pop("model")))
-    values = {key: value for key, value in recorded.items() if key in Config.__dataclass_fields__}
-    values |= {"betas": tuple(values["betas"]), "out": cfg.out, "name": cfg.name, "resume": True, "apply": None}
-    values |= {"result": cfg.result, "threads": cfg.threads, "accelerator": cfg.accelerator}
-    return Config(**values, model=model)
-
-
-def report(
-    cfg: Config,
-    run: Run,
-    generator: PoseTransferGenerator,
-    pairs: PosePairs,
-    device: torch.device,
-    seconds: float,
-    waiting: float,
-) -> None:
-    """Evaluate on unseen pairs; write summary.json, curves.png, sheet.png and meshes/."""
-    figures = evaluate(generator, pairs, device, cfg.eval_pairs)
-    summary = {
-        "test": figures,
-        "test_pairs": cfg.eval_pairs,
-        "units": "PMD and Chamfer (squared, both directions summed) in 1e-3 m^2, correspondence in m",
-        "steps": cfg.steps,
-        "pairs_seen": (cfg.steps or 0) * cfg.batch,
-        "train_minutes": round(seconds / 60, 2),
-        "share_of_time_waiting_for_data": round(waiting / max(seconds, 1e-9), 4),
-        "parameters": sum(p.numel() for p in generator.parameters()),
-        "machine": run.load_json("machine.json"),
-        "threads": torch.get_num_threads(),
-    }
-    run.save_json("summary.json", summary)
-    draw_curves(run)
-    draw_sheet(run, generator, pairs, device)
-    print(f"\n{cfg.eval_pairs} unseen pairs        PMD e-3   Chamfer e-3")
-    for title, key in (("copy the identity", "_copy_identity"), ("copy the warped", "_copy_warped"), ("output", "")):
-        print(f"  {title:<20} {figures[f'pmd{key}']:8.2f}   {figures[f'chamfer{key}']:8.2f}")
-    print(f"matched vertices are {100 * figures['correspondence_m']:.1f} cm from the true ones on average")
-    print(f"pictures, meshes and figures: {run.folder}")
-
-
-def draw_curves(run: Run) -> None:
-    records = run.read_log()
-    names = [name for name in records[-1] if name not in ("step", "seconds", "eval")]
-    window = max(1, len(records) // 100)
-    minutes = torch.tensor([record["seconds"] / 60 for record in records])
-    series = {}
-    for name in names:
-        values = torch.tensor([record[name] for record in records])
-        smooth = torch.nn.functional.avg_pool1d(values[None], window, window)[0]
-        series[name] = (torch.nn.functional.avg_pool1d(minutes[None], window, window)[0], smooth)
-    plot_curves(run.path("curves.png"), series, xlabel="training time (minutes)", ylabel="weighted loss", logy=True)
-    points = [(r["seconds"] / 60, r["eval"]["pmd"]) for r in records if "eval" in r]
-    if points:
-        plot_curves(
-            run.path("pmd.png"),
-            {"24 unseen pairs": ([t for t, _ in points], [value for _, value in points])},
-            xlabel="training time (minutes)",
-            ylabel="PMD (1e-3 m²)",
-            logy=True,
-        )
-
-
-@torch.no_grad()
-def draw_sheet(
-    run: Run, generator: PoseTransferGenerator, pairs: PosePairs, device: torch.device, rows: int = 6
-) -> None:
-    batch = pairs[[(0, i) for i in range(rows)]].to(device)
-    generator.eval()
-    result = generate(generator, batch)
-    output, warped = center(result.vertices), center(result.warped)
-    worst, sheet, captions = 0.15, [], []
-    for b in range(rows):
-        faces, truth = batch.identity_faces[b], batch.ground_truth[b]
-        views = [
-            (batch.identity[b], faces, None),
-            (batch.pose[b], batch.pose_faces[b], None),
-            (warped[b], faces, None),
-            (output[b], faces, None),
-            (truth, faces, None),
-            (output[b], faces, error_colors((output[b] - truth).norm(dim=1), vmax=worst)),
-        ]
-        # One scale per row, so that sizes can be compared.
-        everything = torch.cat([verts for verts, _, _ in views])
-        bounds = torch.stack([everything.amin(0), everything.amax(0)])
-        sheet.append([render(verts, f, colors=colors, bounds=bounds) for verts, f, colors in views])
-        score = 1e3 * float(pmd(output[b : b + 1], batch.ground_truth[b : b + 1]))
-        captions.append(["", "", "", f"PMD {score:.1f}e-3", "", ""])
-        for name, verts, f in (
-            ("identity", batch.identity[b], faces),
-            ("pose", batch.pose[b], batch.pose_faces[b]),
-            ("output", output[b], faces),
-            ("ground_truth", truth, faces),
-        ):
-            save_mesh(run.path("meshes") / f"pair{b}_{name}.obj", verts, f)
-    titles = ["identity", "pose", "warped", "output", "ground truth", "error"]
-    contact_sheet(
-        sheet, column_titles=titles, captions=captions, colorbar=(0.0, 100 * worst, "distance to ground truth (cm)")
-    ).save(run.path("sheet.png"))
-
-
-@torch.no_grad()
-def apply(cfg: Config) -> None:
-    """Pose transfer between two mesh files with a run's weights."""
-    assert cfg.apply is not None
     try:
-        generator, model = load_generator(cfg.out / cfg.name)
-        meshes = [load_mesh(path) for path in cfg.apply]
-        signatures = [
-            intrinsic_descriptors(verts, faces, num_signatures=model.num_signatures)[None]
-            if model.descriptors == "wks"
-            else None
-            for verts, faces in meshes
-        ]
-        (identity, faces), (pose, _) = meshes
-        output = generator(
-            center(identity[None]),
-            center(pose[None]),
-            identity_descriptors=signatures[0],
-            pose_descriptors=signatures[1],
-        )
-        # Training meshes are centred; the result goes to where the pose mesh stands.
-        save_mesh(cfg.result, output.vertices[0] + bounding_box_center(pose[None])[0], faces)
-    except (MeshFileError, ValueError) as error:
-        raise UserError(str(error)) from None
-    except OSError as error:
-        raise UserError(f"cannot write {cfg.result}: {error.strerror}") from None
-    print(f"{cfg.result}: {len(identity)} vertices of {cfg.apply[0]} in the pose of {cfg.apply[1]}")
+        model = GeneratorConfig.from_json(json.dumps(recorded.pop("model")))
+        values = {key: value for key, value in recorded.items() if key in Config.__dataclass_fields__}
+        values |= {"betas": tuple(values["betas"]), "out": cfg.out, "name": cfg.name, "resume": True, "apply": None}
+        values |= {"result": cfg.result, "threads": cfg.threads, "accelerator": cfg.accelerator}
+        return Config(**values, model=model)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"config.json of {cfg.out / cfg.name} is no run's ({error}): choose another --name") from None
 
 
 def main() -> None:
@@ -499,7 +384,7 @@ def main() -> None:
     chosen = words[words.index("--preset") + 1] if "--preset" in words[:-1] else "tiny"
     cfg = tyro.cli(Config, default=PRESETS.get(chosen, PRESETS["tiny"]), description=__doc__)
     if cfg.apply is not None:
-        apply(cfg)
+        apply(cfg.out / cfg.name, cfg.apply, cfg.result)
     else:
         train(cfg)
 

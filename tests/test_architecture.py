@@ -28,7 +28,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "losses": FOUNDATION | {"ot"},
     "metrics": FOUNDATION | {"ot"},
     "consistency": FOUNDATION | {"ot", "losses", "deform"},
-    "models": FOUNDATION | {"nn", "norm", "ot", "descriptors", "io"},  # io: checkpoints are written atomically
+    "models": FOUNDATION
+    | {"nn", "norm", "ot", "deform", "descriptors", "io"},  # io: checkpoints are written atomically
     "io": set(),
     "viz": {"io"},
     "data": FOUNDATION | {"io", "descriptors"},

@@ -84,6 +84,8 @@ class DualReconstruction(nn.Module):
         super().__init__()
         if stop_gradient not in ("none", "deformed"):
             raise ValueError(f'stop_gradient must be "none" or "deformed", got {stop_gradient!r}')
+        if points is not None and points < 1:
+            raise ValueError(f"points must be at least 1, or None for all vertices, got {points}")
         if points is not None and not hasattr(generator, "encode"):
             raise ValueError("points needs a generator with an encode method: features must come from whole meshes")
         self.generator, self.deform = generator, deform

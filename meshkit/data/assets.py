@@ -61,12 +61,17 @@ def load_humans(num_verts: int = 1000) -> RiggedModel:
 
 @dataclass(frozen=True)
 class Split:
-    """Disjoint identities and poses for training and testing, as indices into a model's tables."""
+    """Disjoint identities and poses for training and testing, as indices into a model's tables.
+
+    ``test_pairs`` ``(400, 4)`` lists fixed test pairs: identity and pose of the identity mesh, identity and pose of the
+    pose mesh. Figures over its first n rows compare, whatever the system.
+    """
 
     train_identities: Tensor
     test_identities: Tensor
     train_poses: Tensor
     test_poses: Tensor
+    test_pairs: Tensor
 
 
 def human_split() -> Split:
@@ -86,7 +91,11 @@ def human_split() -> Split:
         return keep.nonzero()[:, 0]
 
     return Split(
-        others(table["identities"], test_identities), test_identities, others(table["poses"], test_poses), test_poses
+        others(table["identities"], test_identities),
+        test_identities,
+        others(table["poses"], test_poses),
+        test_poses,
+        torch.tensor(table["test_pairs"]),
     )
 
 

@@ -49,7 +49,7 @@ class PairBatch:
     def to(self, device: torch.device | str) -> PairBatch:
         """The batch on another device."""
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        moved: dict[str, Any] = {k: None if v is None else v.to(device, non_blocking=True) for k, v in values.items()}
+        moved: dict[str, Any] = {k: None if v is None else v.to(device) for k, v in values.items()}
         return PairBatch(**moved)
 
     def __len__(self) -> int:
@@ -66,7 +66,7 @@ class PosePairs(Dataset[PairBatch]):
     re-indexed to match, and the ground truth follows the identity's order.
 
     Args:
-        model: body with tables of identities and poses.
+        model: body with tables of identities and poses, on the CPU, where pairs are drawn; move the batch afterwards.
         identities: allowed identity indices.
         poses: allowed pose indices.
         length: pairs per epoch.
@@ -75,6 +75,8 @@ class PosePairs(Dataset[PairBatch]):
             change all the same.
         shuffle: permute the vertices.
         pool: take input meshes with their descriptors from this pool. Its identities and poses replace the two lists.
+        listed: ``(L, 4)`` identity and pose of the first mesh, identity and pose of the second: these pairs instead of
+            random ones, ``i`` being the row. A pool must then hold their meshes in this order, two per row.
 
     Raises:
         ValueError: an empty list, or a length below 1.
@@ -102,13 +104,15 @@ class PosePairs(Dataset[PairBatch]):
         resample: bool = True,
         shuffle: bool = True,
         pool: MeshPool | None = None,
+        listed: Tensor | None = None,
     ) -> None:
         if len(identities) == 0 or len(poses) == 0 or length < 1:
             raise ValueError(
                 f"need identities, poses and a positive length, got {len(identities)}, {len(poses)} and {length}"
             )
         self.model, self.identities, self.poses, self.pool = model, identities, poses, pool
-        self.length, self.seed, self.resample, self.shuffle = length, seed, resample, shuffle
+        self.length = length if listed is None else len(listed)
+        self.seed, self.resample, self.shuffle, self.listed = seed, resample, shuffle, listed
 
     def __len__(self) -> int:
         return self.length
@@ -125,7 +129,9 @@ class PosePairs(Dataset[PairBatch]):
     def _draw(self, epoch: int, i: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Two meshes, each an (identity, pose) or a place in the pool, and two vertex orders."""
         what = _generator(self.seed, epoch if self.resample else 0, i)
-        if self.pool is None:
+        if self.listed is not None:
+            first, second = self.listed[i].split(2) if self.pool is None else torch.tensor([[2 * i], [2 * i + 1]])
+        elif self.pool is None:
             who = self.identities[torch.randint(len(self.identities), (2,), generator=what)]
             how = self.poses[torch.randint(len(self.poses), (2,), generator=what)]
             first, second = torch.stack([who, how], 1)
@@ -181,7 +187,7 @@ class PairSampler(Sampler[list[tuple[int, int]]]):
         world_size: number of processes.
 
     Raises:
-        ValueError: an epoch holds less than one batch per process.
+        ValueError: an epoch holds less than one batch per process, or the sizes make no sense.
     """
 
     def __init__(
@@ -195,6 +201,8 @@ class PairSampler(Sampler[list[tuple[int, int]]]):
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
+        if batch_size < 1 or not 0 <= rank < world_size:
+            raise ValueError(f"need a batch and 0 <= rank < world_size, got {batch_size}, {rank} and {world_size}")
         self.steps_per_epoch = length // (batch_size * world_size)
         if self.steps_per_epoch < 1:
             raise ValueError(

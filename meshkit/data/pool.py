@@ -67,21 +67,46 @@ class MeshPool:
             progress: show a progress bar.
 
         Raises:
-            ValueError: ``size`` is smaller than 2.
+            ValueError: ``size`` is smaller than 2, or there is nothing to draw from.
         """
-        from tqdm import tqdm
-
         if size < 2:
             raise ValueError(f"a pool needs at least 2 meshes to make a pair, got {size}")
+        if len(identities) == 0 or len(poses) == 0:
+            raise ValueError(f"need identities and poses to draw from, got {len(identities)} and {len(poses)}")
         generator = torch.Generator().manual_seed(seed)
         identity = identities[torch.randint(len(identities), (size,), generator=generator)]
         pose = poses[torch.randint(len(poses), (size,), generator=generator)]
+        return cls.of(
+            model,
+            identity,
+            pose,
+            num_signatures=num_signatures,
+            num_eigenpairs=num_eigenpairs,
+            workers=workers,
+            progress=progress,
+        )
+
+    @classmethod
+    def of(
+        cls,
+        model: RiggedModel,
+        identity: Tensor,
+        pose: Tensor,
+        *,
+        num_signatures: int = 16,
+        num_eigenpairs: int = 64,
+        workers: int = 1,
+        progress: bool = False,
+    ) -> MeshPool:
+        """The pool of exactly these (identity, pose) combinations; arguments as in :meth:`build`."""
+        from tqdm import tqdm
+
         with torch.no_grad():
             verts = torch.cat([model(i, p) for i, p in zip(identity.split(64), pose.split(64), strict=True)])
         compute = partial(_signature, faces=model.faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs)
         # Spawned processes do not inherit the threads of this one, which forked ones would find half alive.
         context = multiprocessing.get_context("spawn")
-        bar = partial(tqdm, total=size, desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True)
+        bar = partial(tqdm, total=len(verts), desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True)
         if workers <= 1:
             signatures = list(bar(map(compute, verts)))
         else:

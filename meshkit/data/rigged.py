@@ -26,6 +26,8 @@ def rotation_matrices(rotation_vectors: Tensor) -> Tensor:
         >>> rotation_matrices(torch.tensor([0.0, 0.0, torch.pi / 2])).round().int().tolist()
         [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     """
+    dtype = rotation_vectors.dtype
+    rotation_vectors = rotation_vectors.to(torch.promote_types(dtype, torch.float32))
     squared = rotation_vectors.square().sum(-1)[..., None, None]
     small = squared < 1e-12
     angle = torch.where(small, 1.0, squared).sqrt()
@@ -36,7 +38,7 @@ def rotation_matrices(rotation_vectors: Tensor) -> Tensor:
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
     identity = torch.eye(3, dtype=cross.dtype, device=cross.device)
-    return identity + sine * cross + cosine * (cross @ cross)
+    return (identity + sine * cross + cosine * (cross @ cross)).to(dtype)
 
 
 class RiggedModel(nn.Module):
@@ -119,14 +121,18 @@ class RiggedModel(nn.Module):
             if value is not None and value.shape != shape:
                 raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
             self.register_buffer(name, value, persistent=False)
-        if (
-            parents[0] != -1
-            or bool((parents[1:] >= torch.arange(1, num_joints)).any())
-            or bool((parents[1:] < 0).any())
-        ):
+        ancestry = parents.tolist()
+        if ancestry[0] != -1 or not all(0 <= parent < joint for joint, parent in enumerate(ancestry[1:], 1)):
             raise ValueError("joint 0 must be the root (parent -1) and every other joint must come after its parent")
-        self.weights = weights / weights.sum(1, keepdim=True)
-        self._levels = _levels(parents.tolist())
+        sums = weights.sum(1, keepdim=True)
+        if bool((sums <= 0).any()):
+            raise ValueError(
+                f"{int((sums <= 0).sum())} vertices follow no joint: every row of weights needs a positive sum"
+            )
+        if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < num_verts:
+            raise ValueError(f"faces must index {num_verts} vertices, got {int(faces.min())} to {int(faces.max())}")
+        self.weights = weights / sums
+        self._levels = _levels(ancestry)
 
     @property
     def num_joints(self) -> int:

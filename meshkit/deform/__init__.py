@@ -2,6 +2,7 @@
 
 from meshkit.deform.arap import ARAPInfo, arap_deform, arap_energy
 from meshkit.deform.deformer import ARAPDeformer
+from meshkit.deform.moving_least_squares import rigid_moving_least_squares
 from meshkit.deform.rotation import closest_rotation
 from meshkit.topology import cotangent_laplacian, mass_matrix
 
@@ -13,4 +14,5 @@ __all__ = [
     "closest_rotation",
     "cotangent_laplacian",
     "mass_matrix",
+    "rigid_moving_least_squares",
 ]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
+from meshkit.deform import rigid_moving_least_squares
 from meshkit.nn import ConditionalResBlock, SetConvExtractor
 from meshkit.ot import TransportPlan, sinkhorn
 
@@ -94,6 +95,10 @@ class PoseTransferGenerator(nn.Module):
         n_iters: Sinkhorn iterations.
         spectral: spectral normalisation in the blocks.
         residual: the output is the warped mesh plus a learned displacement.
+        rigid_radius: if given, the warped mesh passes through
+            :func:`~meshkit.deform.rigid_moving_least_squares` of this radius (in the unit of the meshes) before the
+            blocks see it. A soft matching averages over all vertices that look alike, most of all those around a limb,
+            and shrinks limbs to their axes; the identity mesh's own local form puts the flesh back.
         normalize_plan: warp with the row-normalised plan (released code). ``False`` warps with the raw plan as the
             paper prints it, whose rows sum to 1/N, so that the warped mesh is N times too small.
 
@@ -125,14 +130,20 @@ class PoseTransferGenerator(nn.Module):
         spectral: bool = True,
         residual: bool = False,
         condition: str = "features",
+        rigid_radius: float | None = None,
         normalize_plan: bool = True,
     ) -> None:
         super().__init__()
+        if not eps > 0 or n_iters < 1 or k < 1:
+            raise ValueError(f"eps, n_iters and k must be positive, got {eps}, {n_iters} and {k}")
+        if not widths or not extractor_widths or min(*widths, *extractor_widths) < 1:
+            raise ValueError(f"widths must be positive, got {extractor_widths} and {widths}")
         if condition not in ("features", "descriptors"):
             raise ValueError(f'condition must be "features" or "descriptors", got {condition!r}')
         if condition == "descriptors" and descriptors == 0:
             raise ValueError('condition="descriptors" needs descriptors: give their number of channels')
-        self.eps, self.n_iters, self.normalize_plan, self.condition = eps, n_iters, normalize_plan, condition
+        self.eps, self.n_iters, self.normalize_plan = eps, n_iters, normalize_plan
+        self.condition, self.rigid_radius = condition, rigid_radius
         self.extractor = SetConvExtractor(extractor_widths, k=k, descriptors=descriptors)
         cond_features = extractor_widths[-1] if condition == "features" else descriptors
         self.transfer = PoseTransferStack(cond_features, widths, spectral=spectral, residual=residual)
@@ -151,6 +162,14 @@ class PoseTransferGenerator(nn.Module):
                 nn.init.xavier_normal_(module.weight)
         # At gain 1 the first outputs are metres away from any body and hundreds of steps go into bringing them back.
         nn.init.normal_(self.transfer.narrow[-1].get_parameter("weight"), std=1e-3)
+        nn.init.zeros_(self.transfer.narrow[-1].get_parameter("bias"))
+
+    @torch.no_grad()
+    def fit_descriptors(self, descriptors: Tensor) -> None:
+        """Take mean and deviation of the training set's descriptors ``(..., D)``; inputs are standardised by them."""
+        flat = descriptors.flatten(0, -2)
+        self.descriptor_mean.copy_(flat.mean(0))
+        self.descriptor_std.copy_(flat.std(0).clamp_min(1e-6))
 
     def encode(self, verts: Tensor, *, mask: Tensor | None = None, descriptors: Tensor | None = None) -> Tensor:
         """Features ``(B, N, D)`` of meshes ``(B, N, 3)``; pass them to :meth:`forward` when one mesh serves twice."""
@@ -202,12 +221,16 @@ class PoseTransferGenerator(nn.Module):
             pose = pose.masked_fill(~pose_mask[..., None], 0.0)
         values = pose.to(plan.kernel.dtype)
         warped = plan.barycentric(values) if self.normalize_plan else plan @ values
-        condition = identity_features
-        if self.condition == "descriptors":
-            if identity_descriptors is None:
-                raise ValueError('condition="descriptors" needs identity_descriptors, also beside identity_features')
-            condition = self._standardise(identity_descriptors)
-        vertices = self.transfer(warped.to(identity.dtype), condition, mask=identity_mask)
+        standard = None if identity_descriptors is None else self._standardise(identity_descriptors)
+        if self.condition == "descriptors" and standard is None:
+            raise ValueError('condition="descriptors" needs identity_descriptors, also beside identity_features')
+        condition = standard if self.condition == "descriptors" else identity_features
+        start = warped.to(identity.dtype)
+        if self.rigid_radius is not None:
+            start = rigid_moving_least_squares(
+                identity, start, radius=self.rigid_radius, mask=identity_mask, features=standard
+            )
+        vertices = self.transfer(start, condition, mask=identity_mask)
         if identity_mask is not None:
             vertices = vertices.masked_fill(~identity_mask[..., None], 0.0)
         return GeneratorOutput(vertices, warped, plan)

@@ -19,6 +19,7 @@ class GeneratorConfig:
     The defaults are the paper's sizes.
 
     Args:
+        condition: as there, or ``"auto"``: descriptors where there are any, else features.
         descriptors: ``"none"`` (coordinates alone, the paper) or ``"wks"``
             (:func:`~meshkit.descriptors.intrinsic_descriptors` besides).
         num_signatures: how many wave-kernel signatures, when there are any.
@@ -32,7 +33,8 @@ class GeneratorConfig:
     spectral: bool = True
     residual: bool = False
     normalize_plan: bool = True
-    condition: str = "features"
+    condition: str = "auto"
+    rigid_radius: float | None = None
     descriptors: str = "none"
     num_signatures: int = 16
 
@@ -41,6 +43,8 @@ class GeneratorConfig:
         if self.descriptors not in ("none", "wks"):
             raise ValueError(f'descriptors must be "none" or "wks", got {self.descriptors!r}')
         arguments = asdict(self)
+        if self.condition == "auto":
+            arguments["condition"] = "features" if self.descriptors == "none" else "descriptors"
         signatures = arguments.pop("num_signatures")
         arguments["descriptors"] = signatures + 1 if self.descriptors == "wks" else 0
         return PoseTransferGenerator(**arguments)
@@ -52,6 +56,8 @@ class GeneratorConfig:
             values: dict[str, Any] = json.loads(text)
         except json.JSONDecodeError as error:
             raise ValueError(f"the model configuration is not JSON: {error}") from error
+        if not isinstance(values, dict):
+            raise ValueError(f"the model configuration must be a JSON object, got {text.strip()[:40]!r}")
         unknown = sorted(set(values) - set(cls.__dataclass_fields__))
         if unknown:
             raise ValueError(
@@ -68,7 +74,7 @@ PRESETS = {
         k=8,
         widths=(256, 128, 64),
         residual=True,
-        condition="descriptors",
+        rigid_radius=0.25,
         descriptors="wks",
     ),
 }
@@ -104,9 +110,9 @@ def load_generator(folder: str | Path) -> tuple[PoseTransferGenerator, Generator
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}: give the folder of a finished or checkpointed run")
     config = GeneratorConfig.from_json((folder / "model.json").read_text())
-    model = config.build()
     try:
+        model = config.build()
         model.load_state_dict(load_file(folder / "model.safetensors"))
-    except Exception as error:  # safetensors and load_state_dict each raise their own kinds
-        raise ValueError(f"the weights in {folder} cannot be read into this model: {error}") from error
+    except Exception as error:  # torch, safetensors and load_state_dict each raise their own kinds
+        raise ValueError(f"the model in {folder} cannot be read: {error}") from error
     return model.eval(), config

@@ -51,6 +51,8 @@ class SetConv(nn.Module):
 
     def forward(self, x: Tensor, positions: Tensor, neighbors: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Convolve ``x`` at ``positions`` over ``neighbors``; ``mask`` is ``(B, N)``, True = real vertex."""
+        if mask is not None:
+            x, positions = (t.masked_fill(~mask[..., None], 0.0) for t in (x, positions))
         to_features, to_position = self.linears[0].get_parameter("weight").split([self.in_features, 3], 1)
         offset = nn.functional.linear(positions.detach(), to_position)
         lifted = nn.functional.linear(x, to_features) + offset

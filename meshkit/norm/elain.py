@@ -83,6 +83,8 @@ class ElaIN(nn.Module):
                 f"expected x with {self.gamma.out_features} and cond with {self.shared.in_features} channels, "
                 f"got {x.shape[2]} and {cond.shape[2]}"
             )
+        if mask is not None:
+            x = x.masked_fill(~mask[..., None], 0.0)
         mean, std = self.statistics(x, mask=mask) if statistics is None else statistics
         scale, shift = self._modulation(cond, mask, mean, std)
         return torch.addcmul(shift, x - mean.to(x.dtype), scale).to(x.dtype)

@@ -36,7 +36,7 @@ def render(
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     supersample: int = 2,
     scale: float | None = None,
-    bounds: ArrayLike | None = None,
+    bounds: Tensor | ArrayLike | None = None,
 ) -> NDArray[np.uint8]:
     """Draw a triangle mesh with an orthographic camera.
 
@@ -167,8 +167,8 @@ def _check_options(
         raise ValueError(f"scale must be a length above 0, got {scale}")
 
 
-def _box_corners(bounds: ArrayLike) -> Array:
-    box = np.asarray(bounds, dtype=np.float64)
+def _box_corners(bounds: Tensor | ArrayLike) -> Array:
+    box = _array(bounds)
     if box.shape != (2, 3) or not np.isfinite(box).all() or (box[0] > box[1]).any():
         raise ValueError(f"bounds must be a finite (2, 3) lowest and highest corner, got {box.tolist()}")
     return np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)

@@ -1,0 +1,46 @@
+"""Pose transfer between two mesh files with a run's weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from _run import UserError
+from torch import Tensor
+
+from meshkit.batching import bounding_box_center, center
+from meshkit.descriptors import intrinsic_descriptors
+from meshkit.io import MeshFileError, load_mesh, save_mesh
+from meshkit.models import GeneratorConfig, load_generator
+
+
+@torch.no_grad()
+def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
+    """Give the first mesh file the pose of the second, with the weights of the run in ``folder``."""
+    try:
+        generator, model = load_generator(folder)
+        meshes = [load_mesh(path) for path in files]
+        descriptors: list[Tensor] | list[None] = [None, None]
+        if model.descriptors == "wks":
+            descriptors = [describe(path, *mesh, model) for path, mesh in zip(files, meshes, strict=True)]
+        (identity, faces), (pose, _) = meshes
+        output = generator(
+            center(identity[None]),
+            center(pose[None]),
+            identity_descriptors=descriptors[0],
+            pose_descriptors=descriptors[1],
+        )
+        # Training meshes are centred; the result goes to where the pose mesh stands.
+        save_mesh(result, output.vertices[0] + bounding_box_center(pose[None])[0], faces)
+    except (MeshFileError, ValueError) as error:
+        raise UserError(str(error)) from None
+    except OSError as error:
+        raise UserError(f"cannot write {result}: {error.strerror}") from None
+    print(f"{result}: {len(identity)} vertices of {files[0]} in the pose of {files[1]}")
+
+
+def describe(path: Path, verts: Tensor, faces: Tensor, model: GeneratorConfig) -> Tensor:
+    try:
+        return intrinsic_descriptors(verts, faces, num_signatures=model.num_signatures)[None]
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from None

@@ -1,0 +1,131 @@
+"""What a run leaves behind: figures on unseen pairs, curves, a contact sheet and meshes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from _run import Run
+from torch import Tensor
+
+from meshkit.batching import center
+from meshkit.data import PairBatch, PosePairs
+from meshkit.io import save_mesh
+from meshkit.metrics import chamfer_distance, correspondence_error, pmd
+from meshkit.models import PoseTransferGenerator
+from meshkit.viz import contact_sheet, error_colors, plot_curves, render
+
+
+@torch.no_grad()
+def evaluate(generator: PoseTransferGenerator, pairs: PosePairs, device: torch.device, count: int) -> dict[str, float]:
+    """Means over ``count`` unseen pairs, of the output and of two baselines; PMD and Chamfer in 1e-3 square metres."""
+    training = generator.training
+    generator.eval()
+    columns: dict[str, list[Tensor]] = {}
+    for start in range(0, count, 4):
+        batch = pairs[[(0, i) for i in range(start, min(start + 4, count))]].to(device)
+        result = generate(generator, batch)
+        candidates = {"": result.vertices, "_copy_identity": batch.identity, "_copy_warped": result.warped}
+        for name, verts in candidates.items():
+            columns.setdefault(f"pmd{name}", []).append(1e3 * pmd(verts, batch.ground_truth))
+            columns.setdefault(f"chamfer{name}", []).append(1e3 * chamfer_distance(center(verts), batch.ground_truth))
+        matched = correspondence_error(result.plan.argmax(), batch.pose, batch.correspondence)
+        columns.setdefault("correspondence_m", []).append(matched)
+    generator.train(training)
+    return {name: round(float(torch.cat(values).mean()), 4) for name, values in columns.items()}
+
+
+def generate(generator: PoseTransferGenerator, batch: PairBatch) -> Any:
+    return generator(
+        batch.identity,
+        batch.pose,
+        identity_descriptors=batch.identity_descriptors,
+        pose_descriptors=batch.pose_descriptors,
+    )
+
+
+def report(
+    run: Run, generator: PoseTransferGenerator, pairs: PosePairs, device: torch.device, facts: dict[str, Any]
+) -> None:
+    """Evaluate on unseen pairs; write summary.json, curves.png, sheet.png and meshes/."""
+    figures = evaluate(generator, pairs, device, len(pairs))
+    summary = {
+        "test": figures,
+        "test_pairs": len(pairs),
+        "units": "PMD and Chamfer (squared, both directions summed) in 1e-3 m^2, correspondence in m",
+        **facts,
+        "parameters": sum(p.numel() for p in generator.parameters()),
+        "machine": run.load_json("machine.json"),
+        "threads": torch.get_num_threads(),
+    }
+    run.save_json("summary.json", summary)
+    draw_curves(run)
+    draw_sheet(run, generator, pairs, device)
+    print(f"\n{len(pairs)} unseen pairs        PMD e-3   Chamfer e-3")
+    for title, key in (("copy the identity", "_copy_identity"), ("copy the warped", "_copy_warped"), ("output", "")):
+        print(f"  {title:<20} {figures[f'pmd{key}']:8.2f}   {figures[f'chamfer{key}']:8.2f}")
+    print(f"matched vertices are {100 * figures['correspondence_m']:.1f} cm from the true ones on average")
+    print(f"pictures, meshes and figures: {run.folder}")
+
+
+def draw_curves(run: Run) -> None:
+    records = run.read_log()
+    if not records:
+        return
+    names = [name for name in records[-1] if name not in ("step", "seconds", "eval")]
+    window = max(1, len(records) // 100)
+    minutes = torch.tensor([record["seconds"] / 60 for record in records])
+    series = {}
+    for name in names:
+        values = torch.tensor([record[name] for record in records])
+        smooth = torch.nn.functional.avg_pool1d(values[None], window, window)[0]
+        series[name] = (torch.nn.functional.avg_pool1d(minutes[None], window, window)[0], smooth)
+    plot_curves(run.path("curves.png"), series, xlabel="training time (minutes)", ylabel="weighted loss", logy=True)
+    points = [(r["seconds"] / 60, r["eval"]["pmd"]) for r in records if "eval" in r]
+    if points:
+        plot_curves(
+            run.path("pmd.png"),
+            {"unseen pairs": ([t for t, _ in points], [value for _, value in points])},
+            xlabel="training time (minutes)",
+            ylabel="PMD (1e-3 m²)",
+            logy=True,
+        )
+
+
+@torch.no_grad()
+def draw_sheet(
+    run: Run, generator: PoseTransferGenerator, pairs: PosePairs, device: torch.device, rows: int = 6
+) -> None:
+    rows = min(rows, len(pairs))
+    batch = pairs[[(0, i) for i in range(rows)]].to(device)
+    generator.eval()
+    result = generate(generator, batch)
+    output, warped = center(result.vertices), center(result.warped)
+    worst, sheet, captions = 0.15, [], []
+    for b in range(rows):
+        faces, truth = batch.identity_faces[b], batch.ground_truth[b]
+        views = [
+            (batch.identity[b], faces, None),
+            (batch.pose[b], batch.pose_faces[b], None),
+            (warped[b], faces, None),
+            (output[b], faces, None),
+            (truth, faces, None),
+            (output[b], faces, error_colors((output[b] - truth).norm(dim=1), vmax=worst)),
+        ]
+        # One scale per row, so that sizes can be compared.
+        everything = torch.cat([verts for verts, _, _ in views])
+        bounds = torch.stack([everything.amin(0), everything.amax(0)])
+        sheet.append([render(verts, f, colors=colors, bounds=bounds) for verts, f, colors in views])
+        score = 1e3 * float(pmd(output[b : b + 1], batch.ground_truth[b : b + 1]))
+        captions.append(["", "", "", f"PMD {score:.1f}e-3", "", ""])
+        for name, verts, f in (
+            ("identity", batch.identity[b], faces),
+            ("pose", batch.pose[b], batch.pose_faces[b]),
+            ("output", output[b], faces),
+            ("ground_truth", truth, faces),
+        ):
+            save_mesh(run.path("meshes") / f"pair{b}_{name}.obj", verts, f)
+    titles = ["identity", "pose", "warped", "output", "ground truth", "error"]
+    contact_sheet(
+        sheet, column_titles=titles, captions=captions, colorbar=(0.0, 100 * worst, "distance to ground truth (cm)")
+    ).save(run.path("sheet.png"))
