@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from meshkit.batching import bounding_box_center
+from meshkit.batching import bounding_box_center, center
 from meshkit.data import (
     MeshPool,
     PairBatch,
@@ -24,6 +24,7 @@ from meshkit.data import (
     rotation_matrices,
 )
 from meshkit.descriptors import wave_kernel_signature
+from meshkit.neighbors import gather_vertices
 
 RESOLUTIONS = [1000, 2000, 3445, 6890]
 resolutions = pytest.mark.parametrize("num_verts", RESOLUTIONS)
@@ -806,3 +807,30 @@ def test_loader_gives_the_same_batches_with_and_without_workers(pairs):
     for mine, theirs, addresses in zip(here, there, sampler, strict=True):
         assert_same(mine, theirs)
         assert_same(mine, pairs[addresses])
+
+
+def test_listed_pairs_are_the_rows_of_the_list_with_and_without_a_pool() -> None:
+    body, split = load_humans(1000), human_split()
+    assert split.test_pairs.shape == (400, 4)
+    assert set(split.test_pairs[:, [0, 2]].flatten().tolist()) <= set(split.test_identities.tolist())
+    assert set(split.test_pairs[:, [1, 3]].flatten().tolist()) <= set(split.test_poses.tolist())
+    assert (split.test_pairs[:, 0] != split.test_pairs[:, 2]).all()
+    listed = split.test_pairs[:3]
+    who, how = listed.view(-1, 2).unbind(1)
+    pool = MeshPool.of(body, who, how, num_signatures=3, num_eigenpairs=5)
+    assert torch.equal(pool.verts, body(who, how))
+    for source in (None, pool):
+        pairs = PosePairs(body, split.test_identities, split.test_poses, listed=listed, pool=source)
+        assert len(pairs) == 3
+        batch = pairs[[(0, 2), (0, 0)]]
+        assert batch.identity_index.tolist() == listed[[2, 0], 0].tolist()
+        assert batch.pose_index.tolist() == listed[[2, 0], 3].tolist()
+        truth = center(body(listed[[2, 0], 0], listed[[2, 0], 3]))
+        ordered = gather_vertices(batch.pose, batch.correspondence)
+        back = gather_vertices(center(body(listed[[2, 0], 2], listed[[2, 0], 3])), _template_order(batch, truth))
+        torch.testing.assert_close(ordered, back, atol=1e-6, rtol=0)
+
+
+def _template_order(batch: PairBatch, truth: torch.Tensor) -> torch.Tensor:
+    """Template vertex of each row of the ground truth, found by position."""
+    return torch.cdist(batch.ground_truth, truth, compute_mode="donot_use_mm_for_euclid_dist").argmin(2)

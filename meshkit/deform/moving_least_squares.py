@@ -7,6 +7,8 @@ from meshkit.deform.rotation import closest_rotation
 
 __all__ = ["rigid_moving_least_squares"]
 
+_PRIOR = 0.02  # share of the whole shape's rotation in each neighbourhood's covariance
+
 
 def rigid_moving_least_squares(
     rest: Tensor, target: Tensor, *, radius: float, mask: Tensor | None = None, features: Tensor | None = None
@@ -18,9 +20,10 @@ def rigid_moving_least_squares(
               \hat v_j = \frac{\sum_i q_{ij} \bigl(\bar t_i + R_i (v_j - \bar v_i)\bigr)}{\sum_i q_{ij}}
 
     with :math:`q_{ij} = \max(0, 1 - \lVert v_i - v_j \rVert^2 / r^2)^2` and means :math:`\bar v_i, \bar t_i` weighted
-    by :math:`q_{ij}`. A target that blurs the shape, such as the barycentric image under a soft matching, gives good
-    positions and directions on the scale of the radius and none below it; there the rest shape fills in. A rigid
-    motion of ``rest`` is reproduced exactly.
+    by :math:`q_{ij}`. What a neighbourhood leaves undetermined, such as the turn of a limb about its own axis, follows
+    the rotation of the whole shape. A target that blurs the shape, such as the barycentric image under a soft matching,
+    gives good positions and directions on the scale of the radius and none below it; there the rest shape fills in. A
+    rigid motion of ``rest`` is reproduced exactly.
 
     Args:
         rest: ``(B, N, 3)`` shape whose local form is kept.
@@ -65,12 +68,25 @@ def rigid_moving_least_squares(
         moments = torch.cat([v, t, (t[..., :, None] * v[..., None, :]).flatten(2)], 2)
         mean_v, mean_t, outer = (q / q.sum(2, keepdim=True) @ moments).split([3, 3, 9], 2)
         covariance = outer.unflatten(2, (3, 3)) - mean_t[..., :, None] * mean_v[..., None, :]
-        rotation = closest_rotation(covariance)
+        rotation = closest_rotation(covariance + _prior(v, t, mask, covariance))
         shift = mean_t - (rotation @ mean_v[..., None])[..., 0]
         blend = q / q.sum(1, keepdim=True)
         motion = blend.mT @ torch.cat([rotation.flatten(2), shift], 2)
         moved = (motion[..., :9].unflatten(2, (3, 3)) @ v[..., None])[..., 0] + motion[..., 9:]
     return moved.to(target.dtype) if mask is None else moved.to(target.dtype).masked_fill(~mask[..., None], 0.0)
+
+
+def _prior(v: Tensor, t: Tensor, mask: Tensor | None, covariance: Tensor) -> Tensor:
+    """A trace of the rotation of the whole shape, to settle what a neighbourhood leaves open.
+
+    A limb shrunk to its axis fixes no rotation about that axis; left to chance, neighbours would disagree and the
+    blend of their motions would shrink the limb again.
+    """
+    count = v.new_full((len(v), 1, 1), float(v.shape[1])) if mask is None else mask.sum(1).to(v.dtype)[:, None, None]
+    mean_v, mean_t = v.sum(1, keepdim=True) / count.clamp_min(1), t.sum(1, keepdim=True) / count.clamp_min(1)
+    whole = closest_rotation(t.mT @ v - count * mean_t.mT @ mean_v)
+    size = torch.linalg.matrix_norm(covariance, keepdim=True)
+    return _PRIOR * size * whole[:, None]
 
 
 def _weights(v: Tensor, radius: float, mask: Tensor | None, features: Tensor | None) -> Tensor:

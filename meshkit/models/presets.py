@@ -114,5 +114,6 @@ def load_generator(folder: str | Path) -> tuple[PoseTransferGenerator, Generator
         model = config.build()
         model.load_state_dict(load_file(folder / "model.safetensors"))
     except Exception as error:  # torch, safetensors and load_state_dict each raise their own kinds
-        raise ValueError(f"the model in {folder} cannot be read: {error}") from error
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"the weights in {folder} cannot be read into this model: {reason}") from error
     return model.eval(), config

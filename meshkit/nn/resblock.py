@@ -36,6 +36,7 @@ class ConditionalResBlock(nn.Module):
         X-DualNet, "Pose transfer module"; LeakyReLU slope 0.2 and spectral norm from the released code.
 
     Example:
+        >>> import torch
         >>> ConditionalResBlock(16, 8)(torch.randn(1, 20, 16), torch.randn(1, 20, 8)).shape
         torch.Size([1, 20, 16])
     """
