@@ -17,7 +17,7 @@ demo: $(READY) ## train X-DualNet for about eight minutes on the shipped bodies 
 	@echo "Pictures: $(CURDIR)/runs/demo"; ls runs/demo/*.png
 
 test: lint ## lint, then run every test and docstring example
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 lint: $(READY) ## ruff and mypy
 	$(BIN)/ruff check --quiet
