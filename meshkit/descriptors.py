@@ -56,7 +56,8 @@ def laplacian_eigenpairs(verts: Tensor, faces: Tensor, k: int = 64, *, tol: floa
     mass = mass_matrix(points, faces.cpu()).numpy()
     if (mass <= 0).any():
         raise ValueError(
-            f"{int((mass <= 0).sum())} of {num} vertices belong to no face of positive area: remove them first"
+            f"{int((mass <= 0).sum())} of {num} vertices belong to no face of positive area, the first is vertex "
+            f"{int((mass <= 0).argmax())} (counting from 0): remove them first"
         )
     scale = np.sqrt(mass.sum() / mass)
     row, column = laplacian.indices().numpy()
@@ -143,7 +144,7 @@ def wave_kernel_signature(
     Args:
         verts: ``(V, 3)``, or a batch ``(B, V, 3)``.
         faces: ``(F, 3)`` int64, or per mesh ``(B, F, 3)`` padded with -1.
-        num_signatures: number of energies.
+        num_signatures: number of energies. 16 suit a network's input; to match surfaces by them alone take 64.
         num_eigenpairs: pairs of the Laplacian used, at most V - 1 (fewer are taken on smaller meshes).
         width: of the bands, in spacings between energies.
         mask: ``(B, V)`` bool, True = real vertex; padded rows come out as 0.

@@ -87,7 +87,7 @@ def load_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
     path = Path(path)
     extension = _extension(path, "read")
     if not path.is_file():
-        raise MeshFileError(f"{path}: no such file")
+        raise MeshFileError(f"{path}: {'a folder, not a mesh file' if path.is_dir() else 'no such file'}")
     reader = {".obj": _read_obj, ".off": _read_off}.get(extension, _read_binary)
     try:
         verts, faces = reader(path)
@@ -158,7 +158,9 @@ def _check(verts: np.ndarray, faces: np.ndarray, name: Path) -> None:
         raise MeshFileError(f"{name}: no faces; a point cloud must be meshed first")
     bad = np.flatnonzero(~np.isfinite(verts).all(1))
     if len(bad):
-        raise MeshFileError(f"{name}: {len(bad)} vertices have NaN or infinite coordinates, first vertex {bad[0]}")
+        raise MeshFileError(
+            f"{name}: {len(bad)} vertices have NaN or infinite coordinates, first vertex {bad[0]} (counting from 0)"
+        )
     outside = np.flatnonzero(((faces < 0) | (faces >= len(verts))).any(1))
     if len(outside):
         raise MeshFileError(

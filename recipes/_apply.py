@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import torch
@@ -20,6 +21,8 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
     try:
         generator, model = load_generator(folder)
         meshes = [load_mesh(path) for path in files]
+        for path, (verts, _) in zip(files, meshes, strict=True):
+            warn(path, verts, model.k)
         descriptors: list[Tensor] | list[None] = [None, None]
         if model.descriptors == "wks":
             descriptors = [describe(path, *mesh, model) for path, mesh in zip(files, meshes, strict=True)]
@@ -37,6 +40,21 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
     except OSError as error:
         raise UserError(f"cannot write {result}: {error.strerror}") from None
     print(f"{result}: {len(identity)} vertices of {files[0]} in the pose of {files[1]}")
+
+
+def warn(path: Path, verts: Tensor, k: int) -> None:
+    """Refuse what the model cannot take; speak up where a mesh is unlike the bodies it was trained on."""
+    if len(verts) < k:
+        raise UserError(f"{path}: {len(verts)} vertices; this model looks at {k} neighbours and needs as many")
+    extent = verts.amax(0) - verts.amin(0)
+    tallest = float(extent.max())
+    if not 0.5 <= tallest <= 2.6:
+        print(
+            f"warning: {path} is {tallest:.3g} long; weights trained on bodies in metres expect about 1 to 2",
+            file=sys.stderr,
+        )
+    if int(extent.argmax()) == 1:
+        print(f"warning: {path} is longest along y; expected z up, facing -y", file=sys.stderr)
 
 
 def describe(path: Path, verts: Tensor, faces: Tensor, model: GeneratorConfig) -> Tensor:

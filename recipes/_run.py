@@ -6,6 +6,7 @@ import ctypes
 import json
 import os
 import platform
+import signal
 import sys
 import time
 from pathlib import Path
@@ -34,7 +35,10 @@ def guard(main: Any, *arguments: Any) -> None:
         print(f"error: {error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
-        print("\ninterrupted: what the last checkpoint holds is kept; --resume goes on from there", file=sys.stderr)
+        print(
+            "\ninterrupted; --resume goes on from the last checkpoint, or begins again if there is none",
+            file=sys.stderr,
+        )
         raise SystemExit(130) from None
 
 
@@ -127,6 +131,18 @@ class Run:
         records = [record for record in self.read_log() if record["step"] <= step]
         with atomic_write(self.log_file) as path:
             path.write_text("".join(json.dumps(record) + "\n" for record in records))
+
+
+class Interruption:
+    """Turns the first Ctrl-C into a wish to stop after the step at hand; a second one interrupts at once."""
+
+    def __init__(self) -> None:
+        self.wanted = False
+        self._previous = signal.signal(signal.SIGINT, self._note)
+
+    def _note(self, *_: Any) -> None:
+        self.wanted = True
+        signal.signal(signal.SIGINT, self._previous)
 
 
 def machine() -> dict[str, Any]:

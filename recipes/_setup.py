@@ -62,6 +62,7 @@ def data(cfg: Any, run: Run, workers: int) -> tuple[PosePairs, PosePairs]:
             key += f"pool {cfg.pool}, seed {cfg.seed}" if side == "train" else f"{len(listed)} pairs"
             stored = run.load_tensors(f"pool_{side}.safetensors", key)
             if stored is None:
+                print(f"meshes to {side} on:", flush=True)
                 stored = make[side]().state_dict()
                 run.save_tensors(f"pool_{side}.safetensors", stored, key)
             pools[side] = MeshPool(**stored)

@@ -16,13 +16,13 @@ import sys
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import torch
 import tyro
 from _apply import apply
 from _report import evaluate, report
-from _run import Run, UserError, guard, keep_freed_memory, pick_precision
+from _run import Interruption, Run, UserError, guard, keep_freed_memory, pick_precision
 from _setup import check, data, resumed
 from lightning_fabric import Fabric
 from torch import Tensor
@@ -49,7 +49,7 @@ class Config:
     resume: bool = False
     """Go on from the run's last checkpoint, if it has one, with the settings it was begun with: of the other flags only
     --out, --name, --threads and --accelerator count then."""
-    apply: tuple[Path, Path] | None = None
+    apply: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="IDENTITY POSE")] = None
     """Do not train: give the first mesh file the pose of the second, with the weights of run --name."""
     result: Path = Path("posed.obj")
     """Where --apply writes the posed mesh."""
@@ -244,6 +244,8 @@ def train(cfg: Config) -> None:
     check(cfg)
     run = Run(cfg.out / cfg.name, resume=cfg.resume)
     state = run.load_state() if cfg.resume else None
+    if cfg.resume and state is None:
+        print(f"{run.folder} has no checkpoint: starting a new run")
     recorded = run.load_json("config.json") if cfg.resume else None
     if recorded is not None:
         cfg = resumed(cfg, recorded)
@@ -282,7 +284,7 @@ def train(cfg: Config) -> None:
         run.cut_log(-1)
 
     clock = time.perf_counter()
-    batches = iter(loader(first, steps))
+    interruption, batches = Interruption(), iter(loader(first, steps))
     bar = tqdm(range(first, steps), total=steps, initial=first, unit="step", dynamic_ncols=True, smoothing=0.05)
     for s in bar:
         asked = time.perf_counter()
@@ -297,8 +299,12 @@ def train(cfg: Config) -> None:
             record["eval"] = evaluate(generator, test_pairs, fabric.device, few)
             bar.write(f"step {s + 1}: PMD {record['eval']['pmd']:.2f}e-3 on {few} unseen pairs")
         run.log(**record)
-        if (s + 1) % cfg.save_every == 0 or s + 1 == steps:
+        if (s + 1) % cfg.save_every == 0 or s + 1 == steps or interruption.wanted:
             run.save_state(generator, optimizer, s + 1, {"seconds": seconds, "waiting": waiting})
+        if interruption.wanted and s + 1 < steps:
+            bar.close()
+            print(f"interrupted after step {s + 1}, which is saved: --resume goes on from there", file=sys.stderr)
+            raise SystemExit(130)
         clock = time.perf_counter()
     report(
         run,

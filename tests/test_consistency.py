@@ -329,3 +329,15 @@ def test_errors():
     ):
         with pytest.raises(ValueError, match="points works on unpadded batches"):
             dual(A, B, **mask)
+
+
+def test_a_plain_generator_gets_no_keywords_and_a_wrong_one_is_told() -> None:
+    a, b = torch.zeros(1, 4, 3), torch.zeros(1, 5, 3)
+    assert DualReconstruction(lambda identity, pose: identity)(a, b).output.shape == a.shape
+    for wrong in (lambda identity, pose: pose, lambda identity, pose: {"vertices": identity}):
+        with pytest.raises(ValueError, match=r"identity's shape.*expected \(1, 4, 3\)"):
+            DualReconstruction(wrong)(a, b)
+    with pytest.raises(ValueError, match="identity must"):
+        DualReconstruction(lambda identity, pose: identity)(a[0], b)
+    with pytest.raises(ValueError, match="points must be at least 1"):
+        DualReconstruction(lambda identity, pose: identity, points=0)

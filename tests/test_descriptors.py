@@ -360,7 +360,7 @@ def spoil(kind: str) -> Mesh:
     [
         ("nan", "1 of 18 vertices are NaN or infinite"),
         ("infinite", "2 of 18 vertices are NaN or infinite"),
-        ("unreferenced", "2 of 20 vertices belong to no face of positive area: remove them first"),
+        ("unreferenced", "2 of 20 vertices belong to no face of positive area, the first is vertex"),
         ("no area", "1 of 18 vertices belong to no face of positive area"),
         ("index", "face indices must lie in"),
     ],

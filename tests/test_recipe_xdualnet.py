@@ -237,6 +237,25 @@ def test_a_killed_run_resumes_as_if_nothing_had_happened(whole: Path, tmp_path: 
     assert changed <= {"name", "out", "resume"}
 
 
+def test_an_interrupted_run_saves_the_step_it_was_in(tmp_path: Path) -> None:
+    folder = tmp_path / "interrupted"
+    arguments = ("--out", tmp_path, "--name", "interrupted", "--steps", 400, *TINY, "--save-every", 400)
+    with subprocess.Popen(
+        command(*arguments), cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + 120
+        while not (folder / "log.jsonl").exists() or not (folder / "log.jsonl").read_text().count("\n"):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.005)
+        process.send_signal(signal.SIGINT)
+        errors = process.communicate(timeout=60)[1]
+        assert process.returncode == 130
+    reached = torch.load(folder / "state.pt", weights_only=True)["step"]
+    assert 1 <= reached < 400
+    assert len(read_log(folder)) == reached
+    assert f"interrupted after step {reached}, which is saved" in errors and "Traceback" not in errors
+
+
 @pytest.mark.parametrize("preset", ["tiny", "paper"])
 def test_the_recorded_configuration_is_the_one_resumed(recipe: ModuleType, preset: str) -> None:
     begun = replace(recipe.PRESETS[preset], steps=77, seed=5, batch=3, arap_from=1.0, supervised=True)
@@ -353,6 +372,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     text = (folder / "identity.obj").read_text().splitlines()
     (folder / "nan.obj").write_text("\n".join(["v nan 0 0", *text[1:]]))
     (folder / "points.obj").write_text("\n".join(line for line in text if line.startswith("v")))
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    (folder / "tetrahedron.obj").write_text(corners + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     (folder / "single.obj").write_text("v 0 0 0\nf 1 1 1\n")
     (folder / "loose.obj").write_text("\n".join([*text, "v 0 0 0"]))
     (folder / "text.obj").write_text("not a mesh")
@@ -390,6 +411,7 @@ def test_transfer_ignores_where_the_meshes_stand(recipe: ModuleType, whole: Path
         ("single.obj", "3 vertices or more"),
         ("points.obj", "no faces"),
         ("loose.obj", "1 of 2001 vertices"),
+        ("tetrahedron.obj", "4 vertices; this model looks at 6 neighbours"),
         ("text.obj", "line 1|no vertices"),
     ],
 )
@@ -404,6 +426,23 @@ def test_bad_meshes_are_named(
     assert str(files / bad) in line
     assert any(part in line for part in said.split("|"))
     assert not result.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [(lambda v: 100 * v, "is 1"), (lambda v: v[:, [0, 2, 1]], "longest along y")],
+    ids=["cm", "y up"],
+)
+def test_meshes_in_other_units_or_axes_are_spoken_of(whole: Path, files: Path, tmp_path: Path, change, said) -> None:
+    verts, faces = load_mesh(files / "pose.ply")
+    verts = verts * (1.7 / (verts.amax(0) - verts.amin(0))[2])
+    save_mesh(tmp_path / "odd.obj", change(verts), faces)
+    run = launch(
+        *("--out", whole.parent, "--name", whole.name, "--result", tmp_path / "posed.obj"),
+        *("--apply", files / "identity.obj", tmp_path / "odd.obj"),
+    )
+    assert run.returncode == 0
+    assert any("odd.obj" in line and said in line for line in run.stderr.splitlines() if line.startswith("warning: "))
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from meshkit.batching import check_verts
 from meshkit.neighbors import gather_vertices
 
 __all__ = ["DualOutput", "DualReconstruction"]
@@ -50,10 +51,11 @@ class DualReconstruction(nn.Module):
     All three passes run in one ``forward``, so that DistributedDataParallel wraps once.
 
     Args:
-        generator: callable ``generator(identity, pose, *, identity_mask=, pose_mask=, identity_descriptors=,
-            pose_descriptors=)`` that returns vertices, or an object with ``vertices`` and optionally ``warped`` and
-            ``plan``. If it has ``encode(verts, mask=, descriptors=)``, each mesh is encoded once and its features are
-            passed on as ``identity_features`` and ``pose_features``: three encodings instead of six.
+        generator: callable ``generator(identity, pose)`` that returns vertices ``(B, N, 3)``, or an object with
+            ``vertices`` and optionally ``warped`` and ``plan``. Masks and descriptors given to ``forward`` are passed
+            on as ``identity_mask``, ``pose_mask``, ``identity_descriptors``, ``pose_descriptors``. If it has
+            ``encode(verts, mask=, descriptors=)``, each mesh is encoded once and its features are passed on as
+            ``identity_features`` and ``pose_features``: three encodings instead of six.
         deform: callable ``deform(rest, target, faces, *, mask=)``, such as :class:`meshkit.deform.ARAPDeformer`.
         points: match this many random vertices of B in the main pass, and run the two auxiliary passes on as many
             vertices of each mesh. The output, the deformer and features see whole meshes. ``None``: all vertices.
@@ -67,7 +69,7 @@ class DualReconstruction(nn.Module):
         With a deformer, the released code computes it without gradient, which is ``stop_gradient="deformed"``.
 
     Example:
-        >>> generator = lambda identity, pose, **_: identity * 0.5
+        >>> generator = lambda identity, pose: identity * 0.5
         >>> result = DualReconstruction(generator)(torch.ones(1, 4, 3), torch.ones(1, 5, 3))
         >>> result.reconstruction_a[0, 0].tolist(), result.reconstruction_b.shape
         ([0.25, 0.25, 0.25], torch.Size([1, 5, 3]))
@@ -116,8 +118,11 @@ class DualReconstruction(nn.Module):
             use_deform: leave the deformer out of this step when ``False`` (the paper adds it in the last 50 epochs).
 
         Raises:
-            ValueError: a deformer without faces, or ``points`` together with masks.
+            ValueError: a deformer without faces, ``points`` together with masks, meshes that are not (B, V, 3), or a
+                generator that does not return vertices of the identity's shape.
         """
+        check_verts(identity, name="identity")
+        check_verts(pose, name="pose")
         if self.points is not None and (identity_mask is not None or pose_mask is not None):
             raise ValueError("points works on unpadded batches; leave it None for ragged ones")
         a = _Mesh(identity, identity_mask, identity_descriptors).encoded(self.generator)
@@ -153,8 +158,15 @@ class DualReconstruction(nn.Module):
         arguments |= {"identity_descriptors": identity.descriptors, "pose_descriptors": pose.descriptors}
         if identity.features is not None:
             arguments |= {"identity_features": identity.features, "pose_features": pose.features}
-        result = self.generator(identity.verts, pose.verts, **arguments)
-        return _Vertices(result) if isinstance(result, Tensor) else result
+        result = self.generator(identity.verts, pose.verts, **{k: v for k, v in arguments.items() if v is not None})
+        result = _Vertices(result) if isinstance(result, Tensor) else result
+        shape = getattr(getattr(result, "vertices", None), "shape", None)
+        if shape != identity.verts.shape:
+            raise ValueError(
+                "the generator must return vertices of the identity's shape, as a tensor or as an object with them as "
+                f".vertices: expected {tuple(identity.verts.shape)}, got {shape and tuple(shape)} in {type(result)}"
+            )
+        return result
 
     def _choose(self, verts: Tensor) -> Tensor | None:
         """Random vertices of each mesh, ``(B, points)``."""

@@ -22,8 +22,8 @@ RESOLUTIONS = (1000, 2000, 3445, 6890)
 def load_humans(num_verts: int = 1000) -> RiggedModel:
     """The shipped human body: 40 shape directions, 74 joints, 200 identities and 1000 poses.
 
-    Metres, z up, facing -y, x towards the body's left. Watertight, genus 0, outward oriented. Distilled from the CC0
-    MakeHuman data; see ``meshkit/data/assets/README.md``.
+    Metres, z up, facing -y, x towards the body's left, the origin at about half the height. Watertight, genus 0,
+    outward oriented. Distilled from the CC0 MakeHuman data; see ``meshkit/data/assets/README.md``.
 
     Args:
         num_verts: resolution of the template: 1000, 2000, 3445 or 6890.

@@ -22,7 +22,7 @@ class ARAPInfo:
         iterations: local-global iterations done.
         residual: largest relative decrease of a mesh's energy in the last iteration, relative to at least 1e-8 of the
             energy of collapsing that mesh to a point; infinity after a single iteration from rest.
-        converged: whether `residual` is at most `tol`.
+        converged: whether `residual` is at most `tol`; never at the default `tol` of 0, which asks for all iterations.
     """
 
     energy: Tensor

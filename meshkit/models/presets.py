@@ -17,26 +17,33 @@ class GeneratorConfig:
     """Arguments of :class:`~meshkit.models.PoseTransferGenerator`, plus which descriptors feed it.
 
     The defaults are the paper's sizes.
-
-    Args:
-        condition: as there, or ``"auto"``: descriptors where there are any, else features.
-        descriptors: ``"none"`` (coordinates alone, the paper) or ``"wks"``
-            (:func:`~meshkit.descriptors.intrinsic_descriptors` besides).
-        num_signatures: how many wave-kernel signatures, when there are any.
     """
 
     extractor_widths: tuple[int, ...] = (32, 64, 128)
+    """Channels of the feature extractor. Paper: 32, 64, 128."""
     k: int = 32
+    """Neighbours in the extractor. Released code: 32."""
     widths: tuple[int, ...] = (1024, 512, 256)
+    """Channels of the residual blocks. Paper: 1024, 512, 256."""
     eps: float = 0.03
+    """Entropic regularisation of the matching. Paper: 0.03."""
     n_iters: int = 5
+    """Sinkhorn iterations. Paper: 5."""
     spectral: bool = True
+    """Spectral normalisation in the blocks. Released code: yes."""
     residual: bool = False
+    """The blocks displace the warped mesh instead of generating all of it. Paper: no."""
     normalize_plan: bool = True
+    """Warp with the row-normalised plan. Released code: yes. Paper: no."""
     condition: str = "auto"
+    """What the blocks know of the identity: features, descriptors, or auto (descriptors where there are any). Paper:
+    features."""
     rigid_radius: float | None = None
+    """Radius of the rigid moving least squares that the warped mesh passes through, in metres. Paper: none."""
     descriptors: str = "none"
+    """none: coordinates alone, the paper; wks: wave-kernel signatures and the size of the mesh besides."""
     num_signatures: int = 16
+    """How many signatures, when there are any."""
 
     def build(self) -> PoseTransferGenerator:
         """The generator of this configuration, freshly initialised."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from meshkit.batching import check_mask
 from meshkit.norm.statistics import instance_statistics
 
 __all__ = ["ElaIN"]
@@ -83,6 +84,7 @@ class ElaIN(nn.Module):
                 f"expected x with {self.gamma.out_features} and cond with {self.shared.in_features} channels, "
                 f"got {x.shape[2]} and {cond.shape[2]}"
             )
+        check_mask(mask, *x.shape[:2])
         if mask is not None:
             x = x.masked_fill(~mask[..., None], 0.0)
         mean, std = self.statistics(x, mask=mask) if statistics is None else statistics

@@ -31,7 +31,8 @@ def sinkhorn(
     .. math:: b_t = \nu / (K^\top a_{t-1}), \qquad a_t = \mu / (K b_t), \qquad T = \mathrm{diag}(a)\,K\,\mathrm{diag}(b)
 
     with uniform marginals :math:`\mu_i = 1/N`, :math:`\nu_j = 1/M` over the real vertices. Row sums are exact after
-    any number of iterations, column sums converge.
+    any number of iterations, column sums converge. The cosine sees directions only: features with a common offset, such
+    as raw signatures, all look alike; standardise them first.
 
     The gradient is that of the iterations as run, not of their limit: every half step has a rank-one Jacobian on the
     kernel, so only the scalings are kept and the gradient is one low-rank product.
