@@ -22,10 +22,13 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
         generator, model = load_generator(folder)
         meshes = [load_mesh(path) for path in files]
         for path, (verts, _) in zip(files, meshes, strict=True):
-            warn(path, verts, model.k)
+            if len(verts) < model.k:
+                raise UserError(f"{path}: {len(verts)} vertices; this model looks at {model.k} neighbours")
         descriptors: list[Tensor] | list[None] = [None, None]
         if model.descriptors == "wks":
             descriptors = [describe(path, *mesh, model) for path, mesh in zip(files, meshes, strict=True)]
+        for path, (verts, _) in zip(files, meshes, strict=True):
+            warn(path, verts)
         (identity, faces), (pose, _) = meshes
         output = generator(
             center(identity[None]),
@@ -42,10 +45,8 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
     print(f"{result}: {len(identity)} vertices of {files[0]} in the pose of {files[1]}")
 
 
-def warn(path: Path, verts: Tensor, k: int) -> None:
-    """Refuse what the model cannot take; speak up where a mesh is unlike the bodies it was trained on."""
-    if len(verts) < k:
-        raise UserError(f"{path}: {len(verts)} vertices; this model looks at {k} neighbours and needs as many")
+def warn(path: Path, verts: Tensor) -> None:
+    """Speak up where a mesh is unlike the bodies a model was trained on."""
     extent = verts.amax(0) - verts.amin(0)
     tallest = float(extent.max())
     if not 0.5 <= tallest <= 2.6:
