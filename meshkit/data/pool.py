@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 
@@ -110,7 +113,7 @@ class MeshPool:
         if workers <= 1:
             signatures = list(bar(map(compute, verts)))
         else:
-            with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as executor:
+            with _one_thread_each(), ProcessPoolExecutor(workers, mp_context=context) as executor:
                 signatures = list(bar(executor.map(compute, [v.numpy() for v in verts], chunksize=8)))
         return cls(identity, pose, verts, torch.stack([torch.as_tensor(s) for s in signatures]))
 
@@ -119,8 +122,20 @@ class MeshPool:
         return {name: getattr(self, name).contiguous() for name in self.__dataclass_fields__}
 
 
-def _one_thread() -> None:
-    torch.set_num_threads(1)
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes started here run their linear algebra on one thread; several each would fight for the cores."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _signature(verts: object, *, faces: Tensor, num_signatures: int, num_eigenpairs: int) -> object:
