@@ -88,7 +88,7 @@ def draw_curves(run: Run) -> None:
             {"unseen pairs": ([t for t, _ in points], [value for _, value in points])},
             xlabel="training time (minutes)",
             ylabel="PMD (1e-3 m²)",
-            logy=True,
+            logy=False,
         )
 
 

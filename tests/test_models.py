@@ -221,7 +221,7 @@ def test_condition_on_descriptors():
 def test_condition_errors():
     with pytest.raises(ValueError, match='condition must be "features" or "descriptors", got \'pose\''):
         PoseTransferGenerator(condition="pose")
-    with pytest.raises(ValueError, match='condition="descriptors" needs descriptors'):
+    with pytest.raises(ValueError, match='condition="descriptors" and match_size need descriptors'):
         PoseTransferGenerator(condition="descriptors")
     assert replace(SMALL, condition="descriptors").build().condition == "descriptors"
 
@@ -434,3 +434,23 @@ def test_initialisation_of_the_linear_maps():
             # A normal deviate, not a uniform one, which ends at 1.7 deviations.
             assert parameter.abs().amax().item() > 2.5 * expected, name
     assert net.transfer.narrow[-1].weight.std().item() == pytest.approx(1e-3, rel=0.2)
+
+
+def test_match_size_warps_the_scaled_pose_mesh():
+    generator = PoseTransferGenerator(**SIZES, descriptors=2, match_size=True)
+    plain = PoseTransferGenerator(**SIZES, descriptors=2)
+    plain.load_state_dict(generator.state_dict())
+    a, b = rand(2, 20, 3, seed=1, dtype=torch.float32), rand(2, 25, 3, seed=2, dtype=torch.float32)
+    da, db = rand(2, 20, 2, seed=3, dtype=torch.float32), rand(2, 25, 2, seed=4, dtype=torch.float32)
+    da[..., 1], db[..., 1] = torch.tensor([[0.4], [0.1]]), torch.tensor([[0.1], [0.3]])  # log sizes of the two pairs
+    features = {"identity_features": plain.encode(a, descriptors=da), "pose_features": plain.encode(b, descriptors=db)}
+    descriptors = {"identity_descriptors": da, "pose_descriptors": db}
+    ratio = torch.tensor([0.3, -0.2]).exp()[:, None, None]
+    expected = plain(a, b * ratio, **features, **descriptors)
+    result = generator(a, b, **descriptors)
+    torch.testing.assert_close(result.warped, expected.warped)
+    torch.testing.assert_close(result.vertices, expected.vertices)
+    with pytest.raises(ValueError, match="match_size needs identity_descriptors and pose_descriptors"):
+        generator(a, b, **features)
+    with pytest.raises(ValueError, match="match_size need descriptors"):
+        PoseTransferGenerator(**SIZES, match_size=True)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
+from meshkit.batching import masked_mean
 from meshkit.deform import rigid_moving_least_squares
 from meshkit.nn import ConditionalResBlock, SetConvExtractor
 from meshkit.ot import TransportPlan, sinkhorn
@@ -99,6 +100,10 @@ class PoseTransferGenerator(nn.Module):
             :func:`~meshkit.deform.rigid_moving_least_squares` of this radius (in the unit of the meshes) before the
             blocks see it. A soft matching averages over all vertices that look alike, most of all those around a limb,
             and shrinks limbs to their axes; the identity mesh's own local form puts the flesh back.
+        match_size: scale the pose mesh about the origin to the identity's size before warping it. Sizes are read from
+            the last descriptor channel, which must be their logarithm, as
+            :func:`~meshkit.descriptors.intrinsic_descriptors` has it. A warp alone gives the identity the limb lengths
+            of the pose mesh's body.
         normalize_plan: warp with the row-normalised plan (released code). ``False`` warps with the raw plan as the
             paper prints it, whose rows sum to 1/N, so that the warped mesh is N times too small.
 
@@ -131,6 +136,7 @@ class PoseTransferGenerator(nn.Module):
         residual: bool = False,
         condition: str = "features",
         rigid_radius: float | None = None,
+        match_size: bool = False,
         normalize_plan: bool = True,
     ) -> None:
         super().__init__()
@@ -140,10 +146,10 @@ class PoseTransferGenerator(nn.Module):
             raise ValueError(f"widths must be positive, got {extractor_widths} and {widths}")
         if condition not in ("features", "descriptors"):
             raise ValueError(f'condition must be "features" or "descriptors", got {condition!r}')
-        if condition == "descriptors" and descriptors == 0:
-            raise ValueError('condition="descriptors" needs descriptors: give their number of channels')
+        if (condition == "descriptors" or match_size) and descriptors == 0:
+            raise ValueError('condition="descriptors" and match_size need descriptors: give their number of channels')
         self.eps, self.n_iters, self.normalize_plan = eps, n_iters, normalize_plan
-        self.condition, self.rigid_radius = condition, rigid_radius
+        self.condition, self.rigid_radius, self.match_size = condition, rigid_radius, match_size
         self.extractor = SetConvExtractor(extractor_widths, k=k, descriptors=descriptors)
         cond_features = extractor_widths[-1] if condition == "features" else descriptors
         self.transfer = PoseTransferStack(cond_features, widths, spectral=spectral, residual=residual)
@@ -220,6 +226,13 @@ class PoseTransferGenerator(nn.Module):
         if pose_mask is not None:
             pose = pose.masked_fill(~pose_mask[..., None], 0.0)
         values = pose.to(plan.kernel.dtype)
+        if self.match_size:
+            if identity_descriptors is None or pose_descriptors is None:
+                raise ValueError("match_size needs identity_descriptors and pose_descriptors, also beside features")
+            growth = masked_mean(identity_descriptors[..., -1:], identity_mask) - masked_mean(
+                pose_descriptors[..., -1:], pose_mask
+            )
+            values = values * growth.exp()[:, None]
         warped = plan.barycentric(values) if self.normalize_plan else plan @ values
         standard = None if identity_descriptors is None else self._standardise(identity_descriptors)
         if self.condition == "descriptors" and standard is None:

@@ -40,6 +40,8 @@ class GeneratorConfig:
     features."""
     rigid_radius: float | None = None
     """Radius of the rigid moving least squares that the warped mesh passes through, in metres. Paper: none."""
+    match_size: bool = False
+    """Scale the pose mesh to the identity's size before warping it, where there are descriptors. Paper: no."""
     descriptors: str = "none"
     """none: coordinates alone, the paper; wks: wave-kernel signatures and the size of the mesh besides."""
     num_signatures: int = 16
@@ -53,6 +55,7 @@ class GeneratorConfig:
         if self.condition == "auto":
             arguments["condition"] = "features" if self.descriptors == "none" else "descriptors"
         signatures = arguments.pop("num_signatures")
+        arguments["match_size"] = self.match_size and self.descriptors != "none"
         arguments["descriptors"] = signatures + 1 if self.descriptors == "wks" else 0
         return PoseTransferGenerator(**arguments)
 
@@ -82,6 +85,7 @@ PRESETS = {
         widths=(256, 128, 64),
         residual=True,
         rigid_radius=0.25,
+        match_size=True,
         descriptors="wks",
     ),
 }
