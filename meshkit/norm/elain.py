@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from meshkit.batching import check_mask
+from meshkit.batching import check_mask, masked_mean
 from meshkit.norm.statistics import instance_statistics
 
 __all__ = ["ElaIN"]
@@ -97,11 +97,9 @@ class ElaIN(nn.Module):
 
     def _modulation(self, cond: Tensor, mask: Tensor | None, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
         """``scale, shift`` with ``y = (x - mean) * scale + shift``, each ``(B, N, C)``."""
-        if mask is None:
-            cond_mean = cond.mean(1, keepdim=True)
-        else:
+        cond_mean = masked_mean(cond, mask)[:, None]
+        if mask is not None:
             cond = cond.masked_fill(~mask[..., None], 0.0)
-            cond_mean = cond.sum(1, keepdim=True) / mask.sum(1).clamp_min(1)[:, None, None]
         w = self.weight(torch.cat([self.shared(cond_mean), mean.to(cond.dtype)], 2)).to(std.dtype)
         gain = w / std
         gamma_weight, gamma_bias = _compose(self.gamma, self.shared)
