@@ -1,6 +1,7 @@
-"""Laplacian spectra against a dense solver and the sphere; wave-kernel signatures against their definition."""
+"""Laplacian spectra against a dense solver and the sphere; signatures against their definition."""
 
 import math
+import sys
 from functools import cache
 
 import numpy as np
@@ -11,7 +12,12 @@ from conftest import assert_near, rand, scatter, scattered_mask
 from torch import Tensor
 
 from meshkit.data import load_humans
-from meshkit.descriptors import intrinsic_descriptors, laplacian_eigenpairs, wave_kernel_signature
+from meshkit.descriptors import (
+    heat_kernel_signature,
+    intrinsic_descriptors,
+    laplacian_eigenpairs,
+    wave_kernel_signature,
+)
 from meshkit.topology import cotangent_laplacian, mass_matrix
 
 Mesh = tuple[Tensor, Tensor]
@@ -400,3 +406,361 @@ def test_meshes_and_spectra_too_small():
         wave_kernel_signature(*sphere(1), num_signatures=1)
     with pytest.raises(ValueError, match="num_eigenpairs"):
         wave_kernel_signature(*sphere(1), num_eigenpairs=1)
+
+
+# Heat-kernel signature
+
+
+def hks_literally(eigenvalues: np.ndarray, vectors: np.ndarray, count: int) -> np.ndarray:
+    """Loops over vertices and times of the definition."""
+    first, last = 4 * math.log(10) / eigenvalues[-1], 4 * math.log(10) / eigenvalues[1]
+    out = np.empty((len(vectors), count))
+    for i in range(count):
+        time = first * (last / first) ** (i / (count - 1))
+        for v in range(len(vectors)):
+            out[v, i] = sum(math.exp(-lam * time) * phi**2 for lam, phi in zip(eigenvalues, vectors[v], strict=True))
+    return out
+
+
+@meshes
+def test_heat_signature_equals_its_definition(name):
+    verts, faces = MESHES[name]()
+    value = heat_kernel_signature(verts, faces, num_signatures=6, num_eigenpairs=20)
+    expected, vectors = dense_eigenpairs(name)
+    literal = hks_literally(expected[:20], vectors[:, :20], 6)
+    assert (value / torch.from_numpy(literal) - 1).abs().max() < 1e-6
+    assert (value.diff(dim=1) < 0).all()
+
+
+def test_heat_signature_of_the_sphere_is_its_heat_trace():
+    """sum_l (2 l + 1) exp(-4 pi l (l + 1) t) at every point, by the addition theorem; 25 pairs are degrees 0 to 4."""
+    verts, faces = sphere(4)
+    value = heat_kernel_signature(verts, faces, num_signatures=5, num_eigenpairs=25)
+    eigenvalues = laplacian_eigenpairs(verts, faces, 25)[0]
+    first, last = (4 * math.log(10) / eigenvalues[i].item() for i in (-1, 1))
+    for i in range(5):
+        time = first * (last / first) ** (i / 4)
+        trace = sum((2 * n + 1) * math.exp(-4 * math.pi * n * (n + 1) * time) for n in range(5))
+        assert_near(value[:, i], torch.full((len(verts),), trace, dtype=torch.float64), 5e-3)
+
+
+def test_heat_signature_of_a_mesh_of_two_components():
+    """Both constants count: each vertex starts as on its own component, whose share of the area is a half."""
+    verts, faces = sphere(1, 0.1)
+    double = torch.cat([verts, verts + 5]), torch.cat([faces, faces + 18])
+    value = heat_kernel_signature(*double, num_signatures=4, num_eigenpairs=20)
+    assert_near(value[:18], value[18:], 1e-8)
+    assert (value > 2).all()
+
+
+@pytest.mark.parametrize("signature", [heat_kernel_signature, wave_kernel_signature])
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_signatures_ignore_the_unit(signature, scale):
+    verts, faces = MESHES["sphere"]()
+    expected = signature(verts, faces, num_eigenpairs=20)
+    assert_near(signature(scale * verts, faces, num_eigenpairs=20), expected, 1e-6)
+
+
+def multiplet(level: int, around: int) -> tuple[int, int]:
+    """``(inside, end)``: numbers of pairs that cut a repeated eigenvalue of the octahedral sphere, and that do not."""
+    verts, faces = sphere(level)
+    mass = mass_matrix(verts, faces).numpy()
+    stiffness = cotangent_laplacian(verts, faces).to_dense().numpy()
+    values = scipy.linalg.eigh(stiffness, np.diag(mass / mass.sum()), eigvals_only=True)
+    repeated = values[1:] - values[:-1] < 1e-8 * values[1:]  # entry k - 1: pairs k and k + 1 belong together
+    inside = next(k for k in range(around, len(values)) if repeated[k - 1])
+    end = next(k for k in range(inside, len(values)) if not repeated[k - 1])
+    return inside, end
+
+
+@pytest.mark.parametrize("signature", [heat_kernel_signature, wave_kernel_signature])
+def test_basis_of_an_eigenspace_does_not_matter_unless_it_is_cut(signature):
+    verts, faces = sphere(2)
+    inside, end = multiplet(2, 20)
+    for k, same in ((end, True), (inside, False)):
+        kept: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
+        laplacian_eigenpairs(verts, faces, end, cache=kept)
+        ((values, vectors, area),) = kept.values()
+        turned = vectors.clone()
+        for value in values:
+            space = (values - value).abs() < 1e-6 * (1 + value)
+            turned[:, space] = vectors[:, space] @ torch.linalg.qr(rand(int(space.sum()), int(space.sum()), seed=1))[0]
+        results = []
+        for basis in (vectors, turned):
+            kept.clear()
+            signature(verts, faces, num_eigenpairs=k, cache=kept)
+            (key,) = kept
+            kept[key] = (values[:k], basis[:, :k], area)
+            results.append(signature(verts, faces, num_eigenpairs=k, cache=kept))
+        difference = (results[0] - results[1]).abs().max() / results[0].abs().max()
+        assert (difference < 1e-10) if same else (difference > 1e-6)
+
+
+def test_heat_signature_of_a_padded_batch_equals_the_loop():
+    verts, faces, mask, singles = ragged(math.nan)
+    value = heat_kernel_signature(verts, faces, num_signatures=6, num_eigenpairs=12, mask=mask)
+    assert (value[~mask] == 0).all()
+    for b, (v, f) in enumerate(singles):
+        assert_near(value[b, mask[b]], heat_kernel_signature(v, f, num_signatures=6, num_eigenpairs=12), 1e-6)
+
+
+# Fast method
+
+
+@cache
+def posed_bodies() -> tuple[Tensor, Tensor]:
+    human = load_humans(1000)
+    with torch.no_grad():
+        return human(torch.tensor([3, 100, 50]), torch.tensor([5, 700, 321])), human.faces
+
+
+def test_fast_eigenpairs_against_the_exact_ones():
+    verts, faces = posed_bodies()
+    for points in verts.double():
+        expected, _ = laplacian_eigenpairs(points, faces, 64)
+        values, vectors = laplacian_eigenpairs(points, faces, 64, method="fast")
+        error = values[1:] / expected[1:] - 1
+        assert (error > -1e-9).all()  # from above, as Ritz values are
+        assert (error[:32] < 1e-5).all() and (error < 0.1).all()
+        mass = mass_matrix(points, faces)
+        gram = vectors.T @ ((mass / mass.sum())[:, None] * vectors)
+        assert_near(gram, torch.eye(64, dtype=torch.float64), 1e-8)
+
+
+@pytest.mark.parametrize(
+    "signature",
+    [
+        lambda *a, **k: heat_kernel_signature(*a, **k).log(),
+        wave_kernel_signature,
+        lambda *a, **k: wave_kernel_signature(*a, width=1.0, **k),
+    ],
+    ids=["heat", "wave", "narrow wave"],
+)
+def test_fast_signatures_within_a_tenth_of_a_deviation(signature):
+    verts, faces = posed_bodies()
+    exact, fast = signature(verts, faces), signature(verts, faces, method="fast")
+    error = (fast - exact).square().mean((0, 1)).sqrt() / exact.std((0, 1))
+    assert error.square().mean().sqrt() < 0.1
+    assert 0 < error.max() < 0.2  # it is another method
+
+
+def test_fast_signatures_ignore_order_place_and_unit():
+    verts, faces = posed_bodies()
+    points = verts[0].double()
+    expected = wave_kernel_signature(points, faces, method="fast")
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
+    value = wave_kernel_signature(points[order], order.argsort()[faces], method="fast")
+    assert_near(value, expected[order], 1e-6)
+    moved = 1000 * points + torch.tensor([30.0, -4.0, 7.0])
+    assert_near(wave_kernel_signature(moved, faces, method="fast"), expected, 1e-6)
+    turned = wave_kernel_signature(points @ rotation().T, faces, method="fast")
+    assert (turned - expected).square().mean().sqrt() < 0.1 * expected.std()
+
+
+def test_fast_method_finds_repeated_eigenvalues():
+    """The octahedral sphere, whose symmetry would keep simpler starting functions from most eigenvectors."""
+    verts, faces = sphere(4)
+    expected, _ = laplacian_eigenpairs(verts, faces, 32)
+    values, _ = laplacian_eigenpairs(verts, faces, 32, method="fast")
+    np.testing.assert_allclose(values[:25], expected[:25], rtol=0.02, atol=1e-6)
+    np.testing.assert_allclose(values[:16], expected[:16], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "k"), [("sphere", 20), ("sheet", 62)])
+def test_fast_method_is_exact_on_small_meshes(name, k):
+    verts, faces = MESHES[name]()
+    values, vectors = laplacian_eigenpairs(verts, faces, k, method="fast")
+    np.testing.assert_allclose(values, dense_eigenpairs(name)[0][:k], rtol=1e-8, atol=1e-8)
+    assert vectors.shape == (len(verts), k)
+
+
+def test_fast_method_on_sheets_that_coincide():
+    """Functions of the position cannot tell the pages of a closed book apart; the exact solver takes over."""
+    verts, faces = book(4, opened=0.0)
+    values, _ = laplacian_eigenpairs(verts, faces, 8, method="fast")
+    np.testing.assert_allclose(values, laplacian_eigenpairs(verts, faces, 8)[0], rtol=1e-8, atol=1e-8)
+
+
+def test_fast_method_on_many_components():
+    verts, faces = sphere(2, 0.05)
+    copies = torch.cat([verts + 5 * i for i in range(14)]), torch.cat([faces + len(verts) * i for i in range(14)])
+    values, _ = laplacian_eigenpairs(*copies, 16, method="fast")
+    np.testing.assert_allclose(values, laplacian_eigenpairs(*copies, 16)[0], rtol=1e-8, atol=1e-8)
+    assert (values[:14] < 1e-6).all() and (values[14:] > 1).all()
+
+
+# Cache
+
+
+def forbid_solving(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("solved again")
+
+    monkeypatch.setattr("meshkit.descriptors._spectrum.normalised_laplacian", fail)
+
+
+@pytest.mark.parametrize("kind", ["mapping", "folder", "folder as text"])
+def test_cached_pairs_are_not_solved_for_again(kind, tmp_path, monkeypatch):
+    verts, faces = sphere(2, 0.05)
+    cache = {"mapping": {}, "folder": tmp_path / "new" / "folder", "folder as text": str(tmp_path)}[kind]
+    options = {"num_eigenpairs": 12, "cache": cache}
+    expected = [wave_kernel_signature(verts, faces, num_eigenpairs=12), laplacian_eigenpairs(verts, faces, 12)[1]]
+    first = wave_kernel_signature(verts, faces, **options)
+    forbid_solving(monkeypatch)
+    pairs = laplacian_eigenpairs(verts, faces, 12, cache=cache)
+    assert torch.equal(first, expected[0]) and torch.equal(pairs[1], expected[1])
+    for signature in (wave_kernel_signature, heat_kernel_signature, intrinsic_descriptors):
+        assert torch.isfinite(signature(verts, faces, **options)).all()
+    padded = torch.cat([faces, torch.full((2, 3), -1)])
+    assert torch.equal(wave_kernel_signature(verts[None], padded[None], **options)[0], first)
+    files = [f for f in tmp_path.rglob("*") if f.is_file()]
+    assert len(cache if kind == "mapping" else files) == 1
+    with pytest.raises(AssertionError, match="solved again"):
+        laplacian_eigenpairs(verts, faces, 12)
+
+
+def test_cache_tells_contents_apart():
+    verts, faces = sphere(2, 0.05)
+    moved = verts.clone()
+    moved[3, 0] += 1e-12
+    kept: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
+    base = (verts, faces, 6)
+    variants = [
+        (base, {}),
+        ((moved, faces, 6), {}),
+        ((verts, faces[1:], 6), {}),
+        ((verts, faces.roll(1, 0), 6), {}),
+        ((verts, faces, 7), {}),
+        (base, {"tol": 1e-3}),
+        (base, {"method": "fast"}),
+    ]
+    for count, (arguments, options) in enumerate(variants, 1):
+        laplacian_eigenpairs(*arguments, **options, cache=kept)
+        assert len(kept) == count
+
+
+def test_changing_a_result_does_not_change_the_cache():
+    verts, faces = sphere(1, 0.1)
+    kept: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
+    values, vectors = laplacian_eigenpairs(verts, faces, 5, cache=kept)
+    expected = values.clone(), vectors.clone()
+    values.zero_(), vectors.zero_()
+    for again, wanted in zip(laplacian_eigenpairs(verts, faces, 5, cache=kept), expected, strict=True):
+        assert torch.equal(again, wanted)
+
+
+def test_cache_serves_every_dtype():
+    verts, faces = sphere(1, 0.1)
+    verts = verts.float()
+    kept: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
+    assert laplacian_eigenpairs(verts, faces, 5, cache=kept)[1].dtype == torch.float32
+    assert laplacian_eigenpairs(verts.double(), faces.int(), 5, cache=kept)[1].dtype == torch.float64
+    assert len(kept) == 1
+
+
+# Robust Laplacian and point clouds
+
+
+def book(pages: int = 3, opened: float = 1.0) -> Mesh:
+    """Sheets that meet in one edge line: edges of as many faces as there are pages. Closed, the pages coincide."""
+    flat, faces = grid(5, 4)
+    verts, triangles = [], []
+    for page in range(pages):
+        angle = torch.tensor(opened * 2 * math.pi * page / pages)
+        verts.append(torch.stack([flat[:, 0] * angle.cos(), flat[:, 0] * angle.sin(), flat[:, 1]], 1))
+        index = torch.arange(20) + 16 * page
+        index[:4] = torch.arange(4)  # the spine, shared
+        triangles.append(index[faces])
+    return torch.cat([verts[0], *(v[4:] for v in verts[1:])]), torch.cat(triangles)
+
+
+def dense_robust(stiffness, mass) -> np.ndarray:
+    weights = mass.diagonal()
+    return scipy.linalg.eigh(stiffness.toarray(), np.diag(weights / weights.sum()), eigvals_only=True)
+
+
+def test_robust_pairs_of_an_edge_of_three_faces_equal_the_dense_solver():
+    package = pytest.importorskip("robust_laplacian")
+    verts, faces = book()
+    expected = dense_robust(*package.mesh_laplacian(verts.numpy(), faces.numpy()))
+    for method in ("exact", "fast"):
+        values, _ = laplacian_eigenpairs(verts, faces, 12, robust=True, method=method)
+        np.testing.assert_allclose(values, expected[:12], rtol=1e-7, atol=1e-7)
+
+
+def test_cotangent_pairs_of_an_edge_of_three_faces_equal_the_dense_solver():
+    verts, faces = book()
+    mass = mass_matrix(verts, faces).numpy()
+    stiffness = cotangent_laplacian(verts, faces).to_dense().numpy()
+    expected = scipy.linalg.eigh(stiffness, np.diag(mass / mass.sum()), eigvals_only=True)
+    np.testing.assert_allclose(laplacian_eigenpairs(verts, faces, 12)[0], expected[:12], rtol=1e-8, atol=1e-8)
+
+
+def test_robust_laplacian_accepts_faces_without_area():
+    pytest.importorskip("robust_laplacian")
+    verts, faces = spoil("no area")
+    value = wave_kernel_signature(verts, faces, num_eigenpairs=8, robust=True)
+    assert torch.isfinite(value).all()
+    with pytest.raises(ValueError, match="2 of 20 vertices belong to no face"):
+        laplacian_eigenpairs(*spoil("unreferenced"), 5, robust=True)
+
+
+@pytest.mark.parametrize("kind", ["mesh", "cloud"])
+def test_robust_spectrum_of_the_sphere(kind):
+    pytest.importorskip("robust_laplacian")
+    verts, faces = sphere(4)
+    values, _ = laplacian_eigenpairs(verts, faces if kind == "mesh" else None, 16, robust=True)
+    expected = [degree * (degree + 1) * 4 * math.pi for degree in range(4) for _ in range(2 * degree + 1)]
+    np.testing.assert_allclose(values, expected, rtol=0.02 if kind == "mesh" else 0.1, atol=1e-6)
+
+
+def test_signatures_of_point_clouds_are_near_those_of_the_surface():
+    pytest.importorskip("robust_laplacian")
+    verts, faces = sphere(3, 0.02)
+    verts = verts * torch.tensor([1.0, 1.5, 2.0])
+    surface = heat_kernel_signature(verts, faces, num_eigenpairs=30).log()
+    cloud = heat_kernel_signature(verts, None, num_eigenpairs=30).log()
+    assert (cloud - surface).square().mean().sqrt() < 0.25 * surface.std(0).mean()
+    order = torch.randperm(len(verts), generator=torch.Generator().manual_seed(0))
+    assert_near(heat_kernel_signature(verts[order], None, num_eigenpairs=30).log(), cloud[order], 1e-6)
+
+
+def test_point_clouds_in_a_padded_batch_equal_the_loop():
+    pytest.importorskip("robust_laplacian")
+    singles = [sphere(2, 0.05)[0], sphere(2, 0.1)[0][:50]]
+    mask = scattered_mask([len(v) for v in singles], 70)
+    verts = scatter(singles, mask, math.nan)
+    value = intrinsic_descriptors(verts, None, num_signatures=4, num_eigenpairs=10, mask=mask)
+    assert (value[~mask] == 0).all()
+    for b, v in enumerate(singles):
+        assert_near(value[b, mask[b]], intrinsic_descriptors(v, None, num_signatures=4, num_eigenpairs=10), 1e-6)
+
+
+@pytest.mark.parametrize(("kind", "message"), [("mesh", "robust=True needs"), ("cloud", "a point cloud .* needs")])
+def test_missing_robust_laplacian_is_named(kind, message, monkeypatch):
+    monkeypatch.setitem(sys.modules, "robust_laplacian", None)
+    verts, faces = sphere(1)
+    with pytest.raises(ImportError, match=message + r".*robust-laplacian: pip install 'meshkit-torch\[solvers\]'"):
+        laplacian_eigenpairs(verts, faces if kind == "mesh" else None, 5, robust=True)
+
+
+# Errors of the options
+
+
+def test_option_errors():
+    verts, faces = sphere(1)
+    mask = torch.ones(1, 18, dtype=torch.bool)
+    with pytest.raises(ValueError, match='method must be "exact" or "fast", got \'slow\''):
+        laplacian_eigenpairs(verts, faces, 5, method="slow")
+    with pytest.raises(ValueError, match="mask needs a batch"):
+        wave_kernel_signature(verts, faces, mask=mask)
+    with pytest.raises(ValueError, match=r"differ in their batch size"):
+        wave_kernel_signature(verts[None], faces.expand(2, -1, -1))
+    with pytest.raises(ValueError, match=r"verts must have shape .* got \(0, 18, 3\)"):
+        wave_kernel_signature(verts.expand(0, -1, -1), faces)
+    hidden = mask.clone()
+    hidden[0, 0] = False
+    with pytest.raises(ValueError, match="4 faces refer to vertices that the mask calls padding"):
+        wave_kernel_signature(verts[None], faces, mask=hidden)
+    with pytest.raises(ValueError, match="num_signatures must be at least 2, got 1"):
+        heat_kernel_signature(verts, faces, num_signatures=1)
