@@ -1,15 +1,33 @@
-"""ElaIN against the paper's equations written with per-vertex convolutions; instance statistics against torch."""
+"""The norms against their equations written with per-vertex maps; modulation and statistics against plain formulas."""
 
 import io
+import math
 
 import pytest
 import torch
 from conftest import GARBAGE, assert_near, rand, scatter, scattered_mask
 from torch import Tensor
-from torch.autograd import gradcheck
+from torch.autograd import gradcheck, gradgradcheck
 from torch.nn.functional import conv1d
 
-from meshkit.norm import ElaIN, instance_statistics
+from meshkit.norm import (
+    SPADE,
+    AdaIN,
+    ConditionalNorm,
+    ElaIN,
+    Modulation,
+    SoftAdaIN,
+    SPAdaIN,
+    _tiles,
+    adain,
+    elain,
+    instance_norm,
+    instance_statistics,
+    modulate,
+    soft_adain,
+    spadain,
+    spade,
+)
 
 VARIANTS = ["released", "paper"]
 variants = pytest.mark.parametrize("variant", VARIANTS)
@@ -104,18 +122,6 @@ def test_padded_batch_equals_the_loop(garbage, variant):
 
 
 @variants
-def test_given_statistics_replace_its_own(variant):
-    norm = make(variant)
-    x, cond, mask = rand(2, 8, C), rand(2, 8, D, seed=1), scattered_mask([5, 8], 8)
-    torch.testing.assert_close(
-        norm(x, cond, mask=mask, statistics=norm.statistics(x, mask=mask)), norm(x, cond, mask=mask)
-    )
-    mean, std = norm.statistics(x, mask=mask)
-    assert torch.equal(std, instance_statistics(x, mask=mask, unbiased=variant == "released")[1])
-    assert (norm(x, cond, statistics=(mean, 2 * std)) - norm(x, cond, statistics=(mean, std))).abs().amax() > 0.1
-
-
-@variants
 def test_constant_channel_gives_the_shift_alone(variant):
     """xhat is 0 there, so y = w beta + (1 - w) mu; the gradient stays finite."""
     norm = make(variant)
@@ -135,7 +141,7 @@ def test_paper_and_released_differ_by_the_normalised_features_up_to_the_variance
     """With sigma shared, the offset alone is left: released - paper = xhat."""
     x, cond = rand(1, 10, C), rand(1, 10, D, seed=1)
     mean, std = instance_statistics(x)
-    released, paper = (make(variant)(x, cond, statistics=(mean, std)) for variant in VARIANTS)
+    released, paper = (modulate(x, make(variant).modulation(cond, mean, std)) for variant in VARIANTS)
     assert_near(released - paper, (x - mean) / std, 1e-12)
 
 
@@ -174,7 +180,8 @@ def test_eps_is_added_to_the_variance(variant):
     norm = make(variant)
     small = ElaIN(C, D, variant=variant, eps=1e-12).double()
     small.load_state_dict(norm.state_dict())
-    assert_near(small(x, cond), norm(x, cond, statistics=(x.mean(1, keepdim=True), small.statistics(x)[1])), 1e-12)
+    mean, std = small.statistics(x)
+    assert_near(small(x, cond), modulate(x, norm.modulation(cond, mean, std)), 1e-12)
     assert (small.statistics(x)[1] < 2e-4).all() and (norm.statistics(x)[1] > 3e-3).all()
 
 
@@ -207,6 +214,364 @@ def test_elain_shape_errors(x, cond, message):
 def test_unknown_variant():
     with pytest.raises(ValueError, match='must be "released" or "paper", got \'printed\''):
         ElaIN(C, D, variant="printed")
+
+
+# Every norm
+
+NORMS = [ElaIN, AdaIN, SoftAdaIN, SPAdaIN, SPADE]
+GLOBAL = [AdaIN, SoftAdaIN]
+every = pytest.mark.parametrize("kind", NORMS)
+
+
+def make_any(kind: type[ConditionalNorm], dtype: torch.dtype = torch.float64, **options) -> ConditionalNorm:
+    norm = kind(C, D, **options).to(dtype)
+    for i, parameter in enumerate(norm.parameters()):
+        parameter.data = 0.5 * rand(*parameter.shape, seed=100 + i, dtype=dtype)
+    return norm
+
+
+def by_function(norm: ConditionalNorm, x: Tensor, cond: Tensor) -> Tensor:
+    """The learned maps one by one, then the functional form."""
+    match norm:
+        case ElaIN():
+            h = norm.shared(cond)
+            w = norm.weight(torch.cat([h.mean(1), x.mean(1)], 1))[:, None]
+            w = w if norm.gate is None else 1 / (1 + (-w).exp())
+            return elain(x, norm.gamma(h), norm.beta(h), weight=w, variant=norm.variant)
+        case SoftAdaIN():
+            h = norm.shared(cond)
+            w = norm.weight(torch.cat([h.mean(1), x.mean(1)], 1))[:, None]
+            return soft_adain(x, h, weight=w if norm.gate is None else 1 / (1 + (-w).exp()))
+        case AdaIN():
+            return adain(x, norm.shared(cond))
+        case SPAdaIN():
+            return spadain(x, norm.gamma(cond), norm.beta(cond))
+        case SPADE():
+            h = norm.shared(cond).clamp_min(0)
+            flat = x.flatten(0, 1)
+            mean, var = flat.mean(0), flat.var(0, correction=0)
+            if not norm.training:
+                mean, var = norm.running_mean, norm.running_var
+            return spade(x, norm.gamma(h), norm.beta(h), mean=mean, var=var)
+    raise AssertionError(norm)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        *((kind, {}) for kind in NORMS),
+        (ElaIN, {"gate": "sigmoid"}),
+        (ElaIN, {"variant": "paper"}),
+        (SoftAdaIN, {"gate": None}),
+        (SPADE, {"hidden": 3}),
+    ],
+)
+@pytest.mark.parametrize("training", [True, False])
+def test_module_equals_its_function(kind, options, training):
+    norm = make_any(kind, **options).train(training)
+    rows = 7 if kind in GLOBAL else 9
+    x, cond = (3 * rand(2, 9, C) + 1).requires_grad_(), rand(2, rows, D, seed=1).requires_grad_()
+    value, expected = norm(x, cond), by_function(norm, x, cond)
+    assert_near(value, expected, 1e-12)
+    names, parameters = zip(*norm.named_parameters(), strict=True)
+    upstream, inputs = rand(2, 9, C, seed=2), [x, cond, *parameters]
+    gradients, truths = (torch.autograd.grad(v, inputs, upstream) for v in (value, expected))
+    for name, gradient, truth in zip(["x", "cond", *names], gradients, truths, strict=True):
+        assert truth.abs().amax() > 1e-3, name
+        assert_near(gradient, truth, 1e-10)
+
+
+def functional(name: str, x: Tensor, mask: Tensor | None = None) -> Tensor:
+    scale, shift = rand(*x.shape, seed=3), rand(*x.shape, seed=4)
+    calls = {
+        "adain": lambda: adain(x, shift, mask=mask, style_mask=mask),
+        "soft_adain": lambda: soft_adain(x, shift, weight=scale[:, :1], mask=mask, style_mask=mask),
+        "elain": lambda: elain(x, scale, shift, weight=scale[:, :1], mask=mask),
+        "spadain": lambda: spadain(x, scale, shift, mask=mask),
+        "instance_norm": lambda: instance_norm(x, mask=mask),
+    }
+    return calls[name]()
+
+
+@pytest.mark.parametrize("name", ["adain", "soft_adain", "elain", "spadain", "instance_norm"])
+def test_functional_equals_its_equation(name):
+    """One channel at a time, with scalar formulas."""
+    x = 3 * rand(2, 9, C) + 1
+    value, scale, shift = functional(name, x), rand(2, 9, C, seed=3), rand(2, 9, C, seed=4)
+    for b in range(2):
+        for c in range(C):
+            v, g, t, w = x[b, :, c], scale[b, :, c], shift[b, :, c], scale[b, 0, c]
+            mu, unbiased = v.mean(), (v.var() + 1e-5) ** 0.5
+            sigma = (((v - mu) ** 2).mean() + 1e-5) ** 0.5
+            mu_t, sigma_t = t.mean(), (((t - t.mean()) ** 2).mean() + 1e-5) ** 0.5
+            expected = {
+                "adain": sigma_t * (v - mu) / sigma + mu_t,
+                "soft_adain": (w * sigma_t + (1 - w) * sigma) * (v - mu) / sigma + w * mu_t + (1 - w) * mu,
+                "elain": (1 + w * g + (1 - w) * unbiased) * (v - mu) / unbiased + w * t + (1 - w) * mu,
+                "spadain": g * (v - mu) / sigma + t,
+                "instance_norm": (v - mu) / sigma,
+            }
+            assert_near(value[b, :, c], expected[name], 1e-12)
+
+
+@pytest.mark.parametrize("name", ["adain", "soft_adain", "elain", "spadain", "instance_norm"])
+def test_functional_padding(name):
+    x, mask = rand(2, 9, C), torch.ones(2, 9, dtype=torch.bool)
+    mask[:, 6:] = False
+    padded = x.masked_fill(~mask[..., None], math.nan)
+    value = functional(name, padded, mask)
+    assert (value[~mask] == 0).all()
+    cut = [t[:, :6] for t in (x, rand(2, 9, C, seed=3), rand(2, 9, C, seed=4))]
+    expected = {
+        "adain": lambda x, s, t: adain(x, t),
+        "soft_adain": lambda x, s, t: soft_adain(x, t, weight=s[:, :1]),
+        "elain": lambda x, s, t: elain(x, s, t, weight=s[:, :1]),
+        "spadain": lambda x, s, t: spadain(x, s, t),
+        "instance_norm": lambda x, s, t: instance_norm(x),
+    }
+    assert_near(value[:, :6], expected[name](*cut), 1e-12)
+
+
+def test_spade_equals_batch_norm():
+    x, batch_norm = rand(3, 9, C), torch.nn.BatchNorm1d(C).double()
+    norm = make_any(SPADE)
+    for p in (*norm.gamma.parameters(), *norm.beta.parameters()):
+        p.data.zero_()
+    cond = rand(3, 9, D)
+    for training in (True, True, False):
+        norm.train(training), batch_norm.train(training)
+        assert_near(norm(x, cond), batch_norm(x.mT).mT, 1e-12)
+        assert_near(norm.running_mean, batch_norm.running_mean, 1e-12)
+        assert_near(norm.running_var, batch_norm.running_var, 1e-12)
+    assert norm.num_batches_tracked == 2
+
+
+def test_adain_of_equal_widths_starts_without_parameters_of_its_own():
+    x, cond = rand(2, 9, C), 2 * rand(2, 7, C, seed=1) + 1
+    assert_near(AdaIN(C, C).double()(x, cond), adain(x, cond), 1e-12)
+
+
+@every
+@pytest.mark.parametrize("garbage", GARBAGE)
+def test_every_norm_ignores_padding(garbage, kind):
+    """A padded batch equals one sample at a time; SPADE, whose statistics are the batch's, in evaluation."""
+    norm, sizes = make_any(kind).eval(), [5, 9, 1]
+    rows = [4, 3, 6] if kind in GLOBAL else sizes
+    xs = [rand(n, C, seed=i).requires_grad_() for i, n in enumerate(sizes)]
+    conds = [rand(n, D, seed=9 + i).requires_grad_() for i, n in enumerate(rows)]
+    mask = scattered_mask(sizes, 12)
+    cond_mask = scattered_mask(rows, 8) if kind in GLOBAL else mask
+    x, cond = scatter(xs, mask, garbage).requires_grad_(), scatter(conds, cond_mask, garbage).requires_grad_()
+    y = norm(x, cond, mask=mask, cond_mask=cond_mask)
+    assert (y[~mask] == 0).all()
+    if kind not in GLOBAL:
+        assert torch.equal(y, norm(x, cond, mask=mask))  # the condition's mask is that of x
+    expected = torch.cat([norm(a[None], c[None])[0] for a, c in zip(xs, conds, strict=True)])
+    assert_near(y[mask], expected, 1e-12)
+    upstream, parameters = rand(*expected.shape, seed=20), list(norm.parameters())
+    gradients = torch.autograd.grad(y[mask], [x, cond, *parameters], upstream)
+    truths = torch.autograd.grad(expected, [*xs, *conds, *parameters], upstream)
+    for padded, samples, real in zip(gradients[:2], (truths[:3], truths[3:6]), (mask, cond_mask), strict=True):
+        assert_near(padded[real], torch.cat(samples), 1e-11, scale=1.0)
+        assert (padded[~real] == 0).all()
+    for gradient, truth in zip(gradients[2:], truths[6:], strict=True):
+        assert_near(gradient, truth, 1e-11)
+
+
+def test_spade_statistics_are_those_of_the_real_vertices_of_the_batch():
+    norm, sizes = make_any(SPADE), [5, 9, 1]
+    xs, conds = ([rand(n, c, seed=i + s) for i, n in enumerate(sizes)] for c, s in ((C, 0), (D, 9)))
+    mask = scattered_mask(sizes, 12)
+    value = norm(scatter(xs, mask, 1e20), scatter(conds, mask, 1e20), mask=mask)[mask]
+    kept = norm.running_var.clone()
+    norm.running_var.fill_(1)
+    assert_near(value, norm(torch.cat(xs)[None], torch.cat(conds)[None])[0], 1e-12)
+    assert_near(norm.running_var, kept, 1e-12)
+
+
+@every
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_padding_under_autocast(kind, dtype):
+    norm = make_any(kind, dtype=torch.float32).eval()
+    x, cond = (3 * rand(2, 40, C)).to(dtype), rand(2, 40, D, seed=1).to(dtype)
+    mask = torch.zeros(2, 70, dtype=torch.bool)
+    mask[:, :40] = True
+    wide_x, wide_cond = (torch.cat([t, t.new_full((2, 30, t.shape[2]), 1e20)], 1) for t in (x, cond))
+    with torch.autocast("cpu", torch.bfloat16):
+        value = norm(wide_x, wide_cond, mask=mask, cond_mask=mask)[:, :40]
+        expected = norm(x, cond)
+    assert value.dtype == expected.dtype == dtype
+    assert_near(value, expected, 8e-3)
+    assert_near(expected, norm.double()(x.double(), cond.double()), 0.03)
+
+
+@every
+def test_every_norm_compiles_to_one_graph(kind):
+    torch._dynamo.reset()
+    norm = make_any(kind).eval()
+    compiled = torch.compile(norm, backend="aot_eager", fullgraph=True)
+    x, cond, mask = rand(2, 9, C).requires_grad_(), rand(2, 9, D, seed=1).requires_grad_(), scattered_mask([9, 5], 9)
+    inputs, upstream = [x, cond, *norm.parameters()], rand(2, 9, C, seed=2)
+    value, expected = (f(x, cond, mask=mask, cond_mask=mask) for f in (compiled, norm))
+    assert_near(value, expected, 1e-12)
+    for gradient, truth in zip(*(torch.autograd.grad(v, inputs, upstream) for v in (value, expected)), strict=True):
+        assert_near(gradient, truth, 1e-10)
+
+
+@every
+def test_function_transforms(kind):
+    """torch.func: a vmap over samples and per-sample gradients equal the batch and the loop."""
+    norm = make_any(kind).eval()
+    x, cond, parameters = rand(3, 5, C), rand(3, 5, D, seed=1), dict(norm.named_parameters())
+
+    def loss(parameters: dict[str, Tensor], x: Tensor, cond: Tensor) -> Tensor:
+        return torch.func.functional_call(norm, parameters, (x[None], cond[None])).square().sum()
+
+    losses = torch.func.vmap(loss, (None, 0, 0))(parameters, x, cond)
+    assert_near(losses, norm(x, cond).square().sum((1, 2)), 1e-12)
+    gradients = torch.func.vmap(torch.func.grad(loss), (None, 0, 0))(parameters, x, cond)
+    for b in range(3):
+        truths = torch.autograd.grad(norm(x[b : b + 1], cond[b : b + 1]).square().sum(), list(parameters.values()))
+        for gradient, truth in zip(gradients.values(), truths, strict=True):
+            assert_near(gradient[b], truth, 1e-11)
+
+
+@every
+def test_state_dict_names(kind):
+    names = {
+        ElaIN: {"shared", "gamma", "beta", "weight"},
+        AdaIN: {"shared"},
+        SoftAdaIN: {"shared", "weight"},
+        SPAdaIN: {"gamma", "beta"},
+        SPADE: {"shared", "gamma", "beta"},
+    }
+    found = {name.split(".")[0] for name, _ in make_any(kind).named_parameters()}
+    assert found == names[kind]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ElaIN(0, 3), "must be positive, got 0, 3"),
+        (lambda: ElaIN(3, 3, gate="tanh"), "gate must be \"sigmoid\" or None, got 'tanh'"),
+        (lambda: SoftAdaIN(3, 3, gate="tanh"), "gate must be \"sigmoid\" or None, got 'tanh'"),
+        (lambda: elain(torch.ones(1, 2, 3), 0, 0, weight=0, variant="x"), 'must be "released" or "paper"'),
+        (lambda: AdaIN(3, 2)(torch.ones(2, 4, 3), torch.ones(1, 4, 2)), r"\(B, M, D\) must agree in B, got"),
+        (lambda: AdaIN(3, 2)(torch.ones(1, 4, 3), torch.ones(1, 4, 3)), "expected x with 3 and cond with 2"),
+        (
+            lambda: AdaIN(3, 2)(torch.ones(1, 4, 3), torch.ones(1, 5, 2), cond_mask=torch.ones(1, 4) > 0),
+            r"cond_mask must have shape \(1, 5\)",
+        ),
+        (lambda: adain(torch.ones(1, 4, 3), torch.ones(1, 4, 2)), "must agree in B and C"),
+        (lambda: soft_adain(torch.ones(4, 3), torch.ones(1, 4, 3), weight=torch.ones(1)), "must agree in B and C"),
+    ],
+)
+def test_norm_errors(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_a_norm_without_modulation_says_so():
+    with pytest.raises(NotImplementedError):
+        ConditionalNorm(2, 2)(torch.ones(1, 3, 2), torch.ones(1, 3, 2))
+
+
+# Modulation
+
+
+def modulation_inputs(features: bool, linear: bool, *, num: int = 11) -> list[Tensor | None]:
+    """x, mean, scale and shift bias, features, scale and shift weight, weight, bias."""
+    b, c, d, o = 2, 4, 3, 5
+    shapes: list[tuple[int, ...] | None] = [(b, num, c), (b, 1, c), (b, 1, c), (b, 1, c)]
+    shapes += [(b, num, d), (b, d, c), (b, d, c)] if features else [None] * 3
+    shapes += [(o, c), (o,)] if linear else [None] * 2
+    return [None if s is None else rand(*s, seed=i).requires_grad_() for i, s in enumerate(shapes)]
+
+
+def call_modulate(slope: float | None, *inputs: Tensor | None) -> Tensor:
+    x, *modulation, weight, bias = inputs
+    return modulate(x, Modulation(*modulation), slope=slope, weight=weight, bias=bias)
+
+
+def modulate_literally(slope: float | None, *inputs: Tensor | None) -> Tensor:
+    x, mean, scale, shift, features, scale_weight, shift_weight, weight, bias = inputs
+    if features is not None:
+        scale = scale + torch.einsum("bnd,bdc->bnc", features, scale_weight)
+        shift = shift + torch.einsum("bnd,bdc->bnc", features, shift_weight)
+    y = scale * (x - mean) + shift
+    y = y if slope is None else torch.where(y > 0, y, slope * y)
+    y = y if weight is None else torch.einsum("oc,bnc->bno", weight, y)
+    return y if bias is None else y + bias
+
+
+forms = pytest.mark.parametrize(
+    ("features", "linear", "slope"), [(True, True, 0.2), (True, False, None), (False, True, 0.0), (False, False, 0.2)]
+)
+
+
+@forms
+@pytest.mark.parametrize("rows", [4, 11, 512])
+def test_modulate_in_tiles_of_any_size(features, linear, slope, rows, monkeypatch):
+    monkeypatch.setattr(_tiles, "ROWS", rows)
+    inputs = modulation_inputs(features, linear)
+    value, expected = call_modulate(slope, *inputs), modulate_literally(slope, *inputs)
+    assert_near(value, expected, 1e-13)
+    given, upstream = [t for t in inputs if t is not None], rand(*value.shape, seed=20)
+    for gradient, truth in zip(*(torch.autograd.grad(v, given, upstream) for v in (value, expected)), strict=True):
+        assert_near(gradient, truth, 1e-12)
+
+
+@forms
+def test_modulate_second_derivatives(features, linear, slope):
+    inputs = modulation_inputs(features, linear, num=3)
+    given = [t for t in inputs if t is not None]
+
+    def function(*tensors: Tensor) -> Tensor:
+        source = iter(tensors)
+        return call_modulate(slope, *(None if t is None else next(source) for t in inputs))
+
+    assert gradcheck(function, given)
+    assert gradgradcheck(function, given, fast_mode=True)
+
+
+@pytest.mark.parametrize("wanted", range(9))
+def test_modulate_gradient_of_one_input_alone(wanted):
+    inputs = [t.detach() for t in modulation_inputs(True, True)]
+    inputs[wanted].requires_grad_()
+    gradients = [
+        torch.autograd.grad(f(0.2, *inputs).sin().sum(), inputs[wanted])[0] for f in (call_modulate, modulate_literally)
+    ]
+    assert_near(*gradients, 1e-12)
+
+
+def test_modulate_without_bias():
+    inputs = [*modulation_inputs(True, True)[:-1], None]
+    assert_near(call_modulate(0.2, *inputs), modulate_literally(0.2, *inputs), 1e-13)
+
+
+def test_modulate_in_half_precision():
+    inputs = [t.detach().requires_grad_() for t in modulation_inputs(True, True, num=40)]
+    x, mean, scale, shift, *others = inputs
+    low = [t.detach().bfloat16() for t in (x,)] + [t.detach().float() for t in (mean, scale, shift)]
+    low = [t.requires_grad_() for t in (*low, *(t.detach().bfloat16() for t in others))]
+    # A slope near 1: where half precision turns a sign, little changes.
+    value, expected = call_modulate(0.9, *low), call_modulate(0.9, *inputs)
+    assert value.dtype == torch.bfloat16
+    assert_near(value, expected, 0.03)
+    upstream = rand(*value.shape, seed=20)
+    gradients = torch.autograd.grad(value, low, upstream.bfloat16())
+    for gradient, truth, tensor in zip(gradients, torch.autograd.grad(expected, inputs, upstream), low, strict=True):
+        assert gradient.dtype == tensor.dtype
+        assert_near(gradient, truth, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"), [({"bias": torch.ones(2)}, "bias needs a weight"), ({"slope": -1.0}, "not be negative")]
+)
+def test_modulate_errors(options, message):
+    one = torch.ones(1, 1, 2)
+    with pytest.raises(ValueError, match=message):
+        modulate(torch.ones(1, 3, 2), Modulation(one, one, one), **options)
 
 
 # Statistics
@@ -276,9 +641,27 @@ def test_statistics_gradcheck():
     [
         ((4, 3), None, r"x must have shape \(B, N, C\) .* got \(4, 3\)"),
         ((1, 0, 3), None, "at least one vertex"),
-        ((1, 4, 3), (1, 3), r"mask must have shape \(1, 4\), got \(1, 3\)"),
+        ((1, 4, 3), (1, 3), r"mask must have shape \(1, 4\) .* got \(1, 3\)"),
     ],
 )
 def test_statistics_errors(shape, mask, message):
     with pytest.raises(ValueError, match=message):
         instance_statistics(torch.ones(shape), mask=None if mask is None else torch.ones(mask, dtype=torch.bool))
+
+
+def test_statistics_in_tiles_and_second_derivatives(monkeypatch):
+    mask = torch.tensor([[True] * 5, [True, False, True, True, False]])
+    for rows in (2, 5):
+        monkeypatch.setattr(_tiles, "ROWS", rows)
+        x = rand(2, 5, 2).requires_grad_()
+        for given in (None, mask):
+            assert gradcheck(lambda x, given=given: instance_statistics(x, mask=given), x)
+            assert gradgradcheck(lambda x, given=given: instance_statistics(x, mask=given), x)
+
+
+def test_statistics_under_vmap():
+    x = rand(3, 2, 5, 2)
+    mean, std = torch.vmap(instance_statistics)(x)
+    for b in range(3):
+        for value, expected in zip((mean[b], std[b]), instance_statistics(x[b]), strict=True):
+            assert_near(value, expected, 1e-14)

@@ -5,24 +5,71 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from meshkit.batching import check_mask, masked_mean
+from meshkit.batching import masked_mean
+from meshkit.norm.base import ConditionalNorm
+from meshkit.norm.modulation import Modulation, compose
 from meshkit.norm.statistics import instance_statistics
 
-__all__ = ["ElaIN"]
+__all__ = ["ElaIN", "elain"]
+
+OFFSET = {"released": 1.0, "paper": 0.0}
 
 
-class ElaIN(nn.Module):
-    r"""Instance normalisation whose scale and shift blend learned parameters with the input's own statistics.
-
-    With :math:`\hat x = (x - \mu)/\sigma`, :math:`h = W_s c + b_s` the condition brought to the width of ``x``, the
-    learned :math:`\gamma = W_\gamma h + b_\gamma`, :math:`\beta = W_\beta h + b_\beta`, and the channel-wise weight
-    :math:`w = W_w [\bar h, \mu] + b_w` from the two means,
+def elain(
+    x: Tensor,
+    gamma: Tensor,
+    beta: Tensor,
+    *,
+    weight: Tensor,
+    mask: Tensor | None = None,
+    variant: str = "released",
+    eps: float = 1e-5,
+) -> Tensor:
+    r"""Instance normalisation whose scale and shift blend given ones with the input's own statistics.
 
     .. math::
         \gamma' = w \gamma + (1 - w) \sigma, \qquad \beta' = w \beta + (1 - w) \mu,
-        \qquad y = (o + \gamma')\, \hat x + \beta'
+        \qquad y = (o + \gamma') \frac{x - \mu}{\sigma} + \beta'
 
     where :math:`o` is 1 for ``variant="released"`` and 0 for ``variant="paper"``.
+
+    Args:
+        x: ``(B, N, C)``.
+        gamma: scale, ``(B, N, C)`` or ``(B, 1, C)``.
+        beta: shift, ``(B, N, C)`` or ``(B, 1, C)``.
+        weight: w, ``(B, 1, C)``: 0 keeps the statistics of ``x``, 1 takes ``gamma`` and ``beta``.
+        mask: ``(B, N)`` bool, True = real vertex.
+        variant: ``"released"`` (offset 1, unbiased variance) or ``"paper"`` (offset 0, biased variance).
+        eps: added to the variance.
+
+    Returns:
+        ``(B, N, C)`` in the dtype of ``x``; padded rows are 0.
+
+    Raises:
+        ValueError: unknown ``variant``, or ``x`` or ``mask`` of another shape or dtype.
+
+    Reference:
+        X-DualNet, "Elastic instance normalization"; the variants are those of :class:`ElaIN`.
+
+    Example:
+        >>> x = torch.tensor([[[1.0], [3.0]]])
+        >>> elain(x, torch.tensor(5.0), torch.tensor(7.0), weight=torch.ones(1, 1, 1), variant="paper", eps=0.0)
+        tensor([[[ 2.],
+                 [12.]]])
+    """
+    check_variant(variant)
+    mean, std = instance_statistics(x, mask=mask, unbiased=variant == "released", eps=eps)
+    scale = OFFSET[variant] + weight * gamma + (1 - weight) * std
+    y = (scale * ((x - mean) / std) + weight * beta + (1 - weight) * mean).to(x.dtype)
+    return y if mask is None else torch.where(mask[..., None], y, 0)
+
+
+class ElaIN(ConditionalNorm):
+    r"""Instance normalisation whose scale and shift blend learned parameters with the input's own statistics.
+
+    :func:`elain` with :math:`\gamma = W_\gamma h + b_\gamma`, :math:`\beta = W_\beta h + b_\beta` learned from the
+    condition brought to the width of ``x``, :math:`h = W_s c + b_s`, and the channel-wise weight
+    :math:`w = W_w [\bar h, \mu] + b_w` from the two means.
 
     There is no activation between :math:`W_s` and :math:`W_\gamma`, :math:`W_\beta`, and ``w`` is constant over the
     vertices. So :math:`w W_\gamma W_s / \sigma` is one small matrix per sample, scale and shift are each one product
@@ -33,14 +80,14 @@ class ElaIN(nn.Module):
         num_features: channels C of ``x``.
         cond_features: channels D of ``cond``.
         variant: ``"released"`` (offset 1, unbiased variance) or ``"paper"`` (offset 0, biased variance).
+        gate: ``"sigmoid"`` bounds w to (0, 1), so that it interpolates; None leaves it unbounded.
         eps: added to the variance.
 
     Shape:
-        ``x`` ``(B, N, C)``, ``cond`` ``(B, N, D)`` with one row per vertex of ``x``, ``mask`` ``(B, N)`` bool shared by
-        both; the result is ``(B, N, C)`` in the dtype of ``x``.
+        As :class:`ConditionalNorm`, with one row of ``cond`` per vertex of ``x``.
 
     Raises:
-        ValueError: unknown ``variant``, or shapes that do not fit.
+        ValueError: unknown ``variant`` or ``gate``, or shapes that do not fit.
 
     Reference:
         X-DualNet, "Elastic instance normalization".
@@ -55,63 +102,49 @@ class ElaIN(nn.Module):
         torch.Size([2, 100, 64])
     """
 
-    def __init__(self, num_features: int, cond_features: int, *, variant: str = "released", eps: float = 1e-5) -> None:
-        super().__init__()
-        if variant not in ("released", "paper"):
-            raise ValueError(f'variant must be "released" or "paper", got {variant!r}')
-        self.variant = variant
-        self.eps = eps
+    def __init__(
+        self,
+        num_features: int,
+        cond_features: int,
+        *,
+        variant: str = "released",
+        gate: str | None = None,
+        eps: float = 1e-5,
+    ) -> None:
+        super().__init__(num_features, cond_features, eps=eps)
+        check_variant(variant)
+        check_gate(gate)
+        self.variant, self.gate = variant, gate
+        self.unbiased = variant == "released"
         self.shared = nn.Linear(cond_features, num_features)
         self.gamma = nn.Linear(num_features, num_features)
         self.beta = nn.Linear(num_features, num_features)
         self.weight = nn.Linear(2 * num_features, num_features)
 
-    def forward(
-        self,
-        x: Tensor,
-        cond: Tensor,
-        *,
-        mask: Tensor | None = None,
-        statistics: tuple[Tensor, Tensor] | None = None,
-    ) -> Tensor:
-        """Normalise ``x`` under ``cond``; ``statistics`` are those of ``x`` when the caller already has them."""
-        if x.dim() != 3 or cond.dim() != 3 or x.shape[:2] != cond.shape[:2]:
-            raise ValueError(
-                f"x (B, N, C) and cond (B, N, D) must agree in B and N, got {tuple(x.shape)}, {tuple(cond.shape)}"
-            )
-        if x.shape[2] != self.gamma.out_features or cond.shape[2] != self.shared.in_features:
-            raise ValueError(
-                f"expected x with {self.gamma.out_features} and cond with {self.shared.in_features} channels, "
-                f"got {x.shape[2]} and {cond.shape[2]}"
-            )
-        check_mask(mask, *x.shape[:2])
-        if mask is not None:
-            x = x.masked_fill(~mask[..., None], 0.0)
-        mean, std = self.statistics(x, mask=mask) if statistics is None else statistics
-        scale, shift = self._modulation(cond, mask, mean, std)
-        return torch.addcmul(shift, x - mean.to(x.dtype), scale).to(x.dtype)
-
-    def statistics(self, x: Tensor, *, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """The statistics this variant uses, to be shared between norms of one input."""
-        return instance_statistics(x, mask=mask, unbiased=self.variant == "released", eps=self.eps)
-
-    def _modulation(self, cond: Tensor, mask: Tensor | None, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-        """``scale, shift`` with ``y = (x - mean) * scale + shift``, each ``(B, N, C)``."""
-        cond_mean = masked_mean(cond, mask)[:, None]
-        if mask is not None:
-            cond = cond.masked_fill(~mask[..., None], 0.0)
-        w = self.weight(torch.cat([self.shared(cond_mean), mean.to(cond.dtype)], 2)).to(std.dtype)
+    def modulation(self, cond: Tensor, mean: Tensor, std: Tensor, *, cond_mask: Tensor | None = None) -> Modulation:
+        """Composed scale and shift."""
+        cond_mean = self.shared(masked_mean(cond, cond_mask)[:, None])
+        w = self.weight(torch.cat([cond_mean, mean.to(cond_mean.dtype)], 2)).to(std.dtype)
+        if self.gate == "sigmoid":
+            w = w.sigmoid()
         gain = w / std
-        gamma_weight, gamma_bias = _compose(self.gamma, self.shared)
-        beta_weight, beta_bias = _compose(self.beta, self.shared)
-        offset = 1.0 if self.variant == "released" else 0.0
-        scale_bias = gain * gamma_bias + (offset + (1 - w) * std) / std
-        shift_bias = w * beta_bias + (1 - w) * mean
-        scale = torch.baddbmm(scale_bias, cond, (gain.mT * gamma_weight).mT)
-        shift = torch.baddbmm(shift_bias, cond, (w.mT * beta_weight).mT)
-        return scale, shift
+        gamma_weight, gamma_bias = compose(self.gamma, self.shared)
+        beta_weight, beta_bias = compose(self.beta, self.shared)
+        return Modulation(
+            mean,
+            scale_bias=gain * gamma_bias + (OFFSET[self.variant] + (1 - w) * std) / std,
+            shift_bias=w * beta_bias + (1 - w) * mean,
+            features=cond,
+            scale_weight=gain * gamma_weight.mT,
+            shift_weight=w * beta_weight.mT,
+        )
 
 
-def _compose(outer: nn.Linear, inner: nn.Linear) -> tuple[Tensor, Tensor]:
-    """Weight and bias of ``outer(inner(.))``."""
-    return outer.weight @ inner.weight, outer.weight @ inner.bias + outer.bias
+def check_variant(variant: str) -> None:
+    if variant not in OFFSET:
+        raise ValueError(f'variant must be "released" or "paper", got {variant!r}')
+
+
+def check_gate(gate: str | None) -> None:
+    if gate not in ("sigmoid", None):
+        raise ValueError(f'gate must be "sigmoid" or None, got {gate!r}')

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-__all__ = ["instance_statistics"]
+from meshkit.batching import check_mask, masked_mean
+from meshkit.norm._tiles import tile_buffer, tiles, traced
+
+__all__ = ["instance_norm", "instance_statistics"]
 
 
 def instance_statistics(
@@ -26,6 +31,9 @@ def instance_statistics(
     Returns:
         ``mean`` and ``std``, each ``(B, 1, C)``, in float32 or better.
 
+    Raises:
+        ValueError: ``x`` or ``mask`` has another shape or dtype, or there is no vertex.
+
     Reference:
         X-DualNet, "Elastic instance normalization", Equation of sigma (biased variance, eps 1e-5).
 
@@ -39,16 +47,81 @@ def instance_statistics(
     """
     if x.dim() != 3 or x.shape[1] == 0:
         raise ValueError(f"x must have shape (B, N, C) with at least one vertex, got {tuple(x.shape)}")
-    if mask is not None and mask.shape != x.shape[:2]:
-        raise ValueError(f"mask must have shape {tuple(x.shape[:2])}, got {tuple(mask.shape)}")
+    check_mask(mask, x.shape[0], x.shape[1])
     x = x.to(torch.promote_types(x.dtype, torch.float32))
-    if mask is None:
-        count = x.new_full((1, 1, 1), float(x.shape[1]))
-        mean = x.mean(1, keepdim=True)
-        centred = x - mean
-    else:
-        count = mask.sum(1).clamp_min(1).to(x.dtype)[:, None, None]
-        mean = x.masked_fill(~mask[..., None], 0.0).sum(1, keepdim=True) / count
-        centred = (x - mean).masked_fill(~mask[..., None], 0.0)
-    variance = centred.square().sum(1, keepdim=True) / (count - float(unbiased)).clamp_min(1.0)
+    mean, variance = _moments(x, mask) if traced() else _Moments.apply(x, mask)
+    if unbiased:
+        count = _count(x, mask)
+        variance = variance * (count / (count - 1).clamp_min(1))
     return mean, (variance + eps).sqrt()
+
+
+def instance_norm(x: Tensor, *, mask: Tensor | None = None, unbiased: bool = False, eps: float = 1e-5) -> Tensor:
+    r"""Normalise each sample and channel over its vertices.
+
+    .. math:: \hat x = (x - \mu) / \sigma
+
+    with the statistics of :func:`instance_statistics`, whose arguments these are.
+
+    Returns:
+        ``(B, N, C)`` in the dtype of ``x``; padded rows are 0.
+
+    Example:
+        >>> instance_norm(torch.tensor([[[1.0], [3.0]]]), eps=0.0).flatten().tolist()
+        [-1.0, 1.0]
+    """
+    mean, std = instance_statistics(x, mask=mask, unbiased=unbiased, eps=eps)
+    y = ((x - mean) / std).to(x.dtype)
+    return y if mask is None else torch.where(mask[..., None], y, 0)
+
+
+def _count(x: Tensor, mask: Tensor | None) -> Tensor:
+    """Number of real vertices, at least 1, ``(B or 1, 1, 1)``."""
+    if mask is None:
+        return x.new_full((1, 1, 1), x.shape[1])
+    return mask.sum(1).clamp_min(1).to(x.dtype)[:, None, None]
+
+
+def _moments(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Mean and biased variance: the definition."""
+    mean = masked_mean(x, mask)[:, None]
+    return mean, masked_mean((x - mean).square(), mask)[:, None]
+
+
+class _Moments(torch.autograd.Function):
+    """:func:`_moments` in tiles: two passes over ``x`` forward and one backward, and no copy of ``x`` in between."""
+
+    @staticmethod
+    def forward(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+        mean = masked_mean(x, mask)[:, None]
+        squares, work = torch.zeros_like(mean), tile_buffer(x, x.dtype)
+        for b, rows in tiles(x):
+            centred = torch.sub(x[b, rows], mean[b], out=work[: rows.stop - rows.start])
+            if mask is not None:
+                centred.masked_fill_(~mask[b, rows, None], 0.0)
+            squares[b] += centred.square_().sum(0)
+        return mean, squares / _count(x, mask)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        x, mask = inputs
+        ctx.save_for_backward(x, output[0], mask)
+
+    @staticmethod
+    def backward(ctx: Any, grad_mean: Tensor, grad_variance: Tensor) -> tuple[Tensor, None]:
+        x, mean, mask = ctx.saved_tensors
+        if torch.is_grad_enabled():  # of second order: differentiate the definition
+            return torch.func.vjp(lambda x: _moments(x, mask), x)[1]((grad_mean, grad_variance))[0], None
+        count = _count(x, mask)
+        offset, gain = grad_mean / count, 2 * grad_variance / count
+        grad, work = torch.empty_like(x), tile_buffer(x, x.dtype)
+        for b, rows in tiles(x):
+            centred = torch.sub(x[b, rows], mean[b], out=work[: rows.stop - rows.start])
+            tile = torch.addcmul(offset[b], centred, gain[b], out=grad[b, rows])
+            if mask is not None:
+                tile.masked_fill_(~mask[b, rows, None], 0.0)
+        return grad, None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], x: Tensor, mask: Tensor | None) -> Any:
+        return torch.vmap(_moments, in_dims)(x, mask), (0, 0)

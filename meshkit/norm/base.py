@@ -1,0 +1,98 @@
+"""What the conditional norms have in common: one signature, one evaluation."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from meshkit.batching import check_mask
+from meshkit.norm.modulation import Modulation, modulate
+from meshkit.norm.statistics import instance_statistics
+
+__all__ = ["ConditionalNorm"]
+
+
+class ConditionalNorm(nn.Module):
+    """A norm of ``x`` whose scale and shift come from a condition; subclasses say how, in :meth:`modulation`.
+
+    Args:
+        num_features: channels C of ``x``.
+        cond_features: channels D of ``cond``.
+        eps: added to the variance.
+
+    Shape:
+        ``x (B, N, C)`` and ``cond (B, M, D)`` with masks ``(B, N)`` and ``(B, M)``; the result is ``(B, N, C)`` in the
+        dtype of ``x``, 0 at padded vertices. Where ``per_vertex``, M = N, row n of ``cond`` belongs to vertex
+        n of ``x``, and ``cond_mask`` is ``mask`` unless given. Otherwise ``cond`` may have any number of rows.
+
+    Raises:
+        ValueError: shapes that do not fit.
+
+    Example:
+        A norm of one's own, which runs fused in a :class:`~meshkit.nn.ConditionalResBlock` like the package's:
+
+        >>> from meshkit.batching import masked_mean
+        >>> class ShiftByMean(ConditionalNorm):
+        ...     per_vertex = False
+        ...
+        ...     def modulation(self, cond, mean, std, *, cond_mask=None):
+        ...         return Modulation(mean, scale_bias=1 / std, shift_bias=masked_mean(cond, cond_mask)[:, None])
+        >>> ShiftByMean(8, 8)(torch.randn(2, 100, 8), torch.randn(2, 50, 8)).shape
+        torch.Size([2, 100, 8])
+    """
+
+    per_vertex = True
+    unbiased = False
+
+    def __init__(self, num_features: int, cond_features: int, *, eps: float = 1e-5) -> None:
+        super().__init__()
+        if num_features < 1 or cond_features < 1:
+            raise ValueError(f"num_features and cond_features must be positive, got {num_features}, {cond_features}")
+        self.num_features, self.cond_features, self.eps = num_features, cond_features, eps
+
+    def forward(
+        self, x: Tensor, cond: Tensor, *, mask: Tensor | None = None, cond_mask: Tensor | None = None
+    ) -> Tensor:
+        """Normalise ``x`` under ``cond``."""
+        x, cond, cond_mask = self.prepare(x, cond, mask, cond_mask)
+        mean, std = self.statistics(x, mask=mask)
+        y = modulate(x, self.modulation(cond, mean, std, cond_mask=cond_mask))
+        return y if mask is None else torch.where(mask[..., None], y, 0)
+
+    def prepare(
+        self, x: Tensor, cond: Tensor, mask: Tensor | None, cond_mask: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Check the arguments of :meth:`forward`; returns ``x``, ``cond`` with padding zeroed, and ``cond_mask``."""
+        rows = "B and N" if self.per_vertex else "B"
+        if x.dim() != 3 or cond.dim() != 3 or x.shape[: 1 + self.per_vertex] != cond.shape[: 1 + self.per_vertex]:
+            raise ValueError(
+                f"x (B, N, C) and cond (B, {'N' if self.per_vertex else 'M'}, D) must agree in {rows}, "
+                f"got {tuple(x.shape)}, {tuple(cond.shape)}"
+            )
+        if x.shape[2] != self.num_features or cond.shape[2] != self.cond_features:
+            raise ValueError(
+                f"expected x with {self.num_features} and cond with {self.cond_features} channels, "
+                f"got {x.shape[2]} and {cond.shape[2]}"
+            )
+        if self.per_vertex and cond_mask is None:
+            cond_mask = mask
+        check_mask(mask, *x.shape[:2])
+        check_mask(cond_mask, *cond.shape[:2], name="cond_mask")
+        if mask is not None:
+            x = x.masked_fill(~mask[..., None], 0.0)
+        if cond_mask is not None:
+            cond = cond.masked_fill(~cond_mask[..., None], 0.0)
+        return x, cond, cond_mask
+
+    def statistics(self, x: Tensor, *, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Mean and deviation ``(B, 1, C)`` that ``x`` is normalised by."""
+        return instance_statistics(x, mask=mask, unbiased=self.unbiased, eps=self.eps)
+
+    def shares_statistics(self, other: ConditionalNorm) -> bool:
+        """Whether :meth:`statistics` of ``other`` are the same for the same ``x``, so that they are needed once."""
+        own = (type(norm).statistics is ConditionalNorm.statistics for norm in (self, other))
+        return all(own) and (self.unbiased, self.eps) == (other.unbiased, other.eps)
+
+    def modulation(self, cond: Tensor, mean: Tensor, std: Tensor, *, cond_mask: Tensor | None = None) -> Modulation:
+        """Scale and shift for a condition whose padded rows are zero, given the statistics of ``x``."""
+        raise NotImplementedError
