@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format clean
+.PHONY: help demo test lint format scatter clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -27,6 +27,10 @@ lint: $(READY) ## ruff and mypy
 format: $(READY) ## rewrite the sources in the project's style
 	$(BIN)/ruff check --fix --quiet
 	$(BIN)/ruff format --quiet
+
+scatter: $(READY) ## build the optional torch-scatter backend in .venv, seven minutes or more, and test it
+	$(PIP) install --no-build-isolation torch-scatter==2.1.2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/test_scatter.py
 
 clean: ## remove the virtual environment, caches and builds (runs/ is kept)
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

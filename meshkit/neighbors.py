@@ -18,14 +18,16 @@ def knn(
     *,
     query: Tensor | None = None,
     mask: Tensor | None = None,
+    include_self: bool = True,
     method: str = "auto",
 ) -> Tensor:
     r"""Indices of the ``k`` nearest points of each query, nearest first.
 
     .. math:: \mathrm{knn}(q) = \operatorname{arg\,min}^{k}_{j} \lVert q - p_j \rVert_2
 
-    A query that is itself one of the points has itself as first neighbour (up to ties between coincident points).
-    The search carries no gradient.
+    A query that is itself one of the points has itself as first neighbour (up to ties between coincident points),
+    unless ``include_self`` is False. The search carries no gradient and never holds the N x N distances. A graph that
+    torch.compile traces breaks at the tree and at the mask's values, which the error message depends on.
 
     Args:
         points: ``(B, N, 3)`` (or any number of coordinates).
@@ -33,6 +35,7 @@ def knn(
         query: ``(B, Q, 3)``; the points themselves when ``None``.
         mask: ``(B, N)`` bool, True = real point. Padded points are never returned. Rows of padded queries hold valid
             but meaningless indices.
+        include_self: False to search the k nearest others of each point; for the points themselves as queries.
         method: ``"tree"`` (SciPy's KD-tree, CPU), ``"tiles"`` (blocks of the distance matrix, any device) or
             ``"auto"``: the tree on the CPU, tiles elsewhere.
 
@@ -40,7 +43,8 @@ def knn(
         ``(B, Q, k)`` int64.
 
     Raises:
-        ValueError: shapes do not fit, ``k`` is not positive, or a sample has fewer than ``k`` real points.
+        ValueError: shapes do not fit, ``k`` is not positive, a sample has fewer than ``k`` real points (others, if
+            not ``include_self``), or ``include_self`` is False for other queries.
 
     Example:
         >>> line = torch.arange(5.0)[None, :, None]
@@ -53,12 +57,14 @@ def knn(
         raise ValueError(f"query must have shape (B, Q, C) like points {tuple(points.shape)}, got {tuple(query.shape)}")
     if method not in ("auto", "tree", "tiles"):
         raise ValueError(f'method must be "auto", "tree" or "tiles", got {method!r}')
+    if query is not None and not include_self:
+        raise ValueError("include_self=False is for the points among themselves: leave query out")
     check_mask(mask, *points.shape[:2])
     fewest = points.shape[1] if mask is None else int(mask.sum(1).min()) if len(mask) else 0
-    if not 1 <= k <= fewest:
+    if not 1 <= k <= fewest - (not include_self):
         raise ValueError(
-            f"k={k} neighbours were asked for, but the smallest mesh of the batch has {fewest} vertices: "
-            "use a smaller k or a larger mesh"
+            f"k={k} neighbours were asked for, but the smallest mesh of the batch has {fewest} vertices"
+            f"{'' if include_self else ', itself included'}: use a smaller k or a larger mesh"
         )
     dtype = torch.promote_types(points.dtype, torch.float32)
     points = points.detach().to(dtype)
@@ -66,10 +72,10 @@ def knn(
     if method == "auto":
         method = "tree" if points.device.type == "cpu" else "tiles"
     search = _knn_tree if method == "tree" else _knn_tiles
-    return search(points, query, k, mask)
+    return search(points, query, k, mask, include_self)
 
 
-def _knn_tree(points: Tensor, query: Tensor, k: int, mask: Tensor | None) -> Tensor:
+def _knn_tree(points: Tensor, query: Tensor, k: int, mask: Tensor | None, include_self: bool) -> Tensor:
     import numpy as np
     from scipy.spatial import cKDTree
 
@@ -80,13 +86,19 @@ def _knn_tree(points: Tensor, query: Tensor, k: int, mask: Tensor | None) -> Ten
         # A NaN would make the tree raise from inside SciPy; far away it simply is nobody's neighbour.
         cloud = torch.nan_to_num(cloud, nan=1e30, posinf=1e30, neginf=-1e30)
         asked = torch.nan_to_num(query[b].double().cpu(), nan=1e30, posinf=1e30, neginf=-1e30)
-        index = cKDTree(cloud.numpy()).query(asked.numpy(), k=range(1, k + 1))[1]
+        wanted = range(1, k + 1 if include_self else k + 2)
+        index = cKDTree(cloud.numpy()).query(asked.numpy(), k=wanted, workers=torch.get_num_threads())[1]
         index = torch.from_numpy(np.ascontiguousarray(index, dtype=np.int64))
-        rows.append(index if real is None else real[index])
+        index = index if real is None else real[index]
+        if not include_self:
+            surplus = index == torch.arange(len(index))[:, None]
+            surplus[:, -1] |= ~surplus.any(1)  # among coincident points it need not have found itself
+            index = index[~surplus].view(-1, k)
+        rows.append(index)
     return torch.stack(rows).to(points.device)
 
 
-def _knn_tiles(points: Tensor, query: Tensor, k: int, mask: Tensor | None) -> Tensor:
+def _knn_tiles(points: Tensor, query: Tensor, k: int, mask: Tensor | None, include_self: bool) -> Tensor:
     batch, num = points.shape[:2]
     far = torch.finfo(points.dtype).max
     step = max(1, _TILE_ELEMENTS // (batch * num))
@@ -98,6 +110,8 @@ def _knn_tiles(points: Tensor, query: Tensor, k: int, mask: Tensor | None) -> Te
         tile = torch.nan_to_num(tile, nan=far, posinf=far)
         if mask is not None:
             tile = tile.masked_fill(~mask[:, None], torch.inf)
+        if not include_self:
+            tile[:, :, start : start + step].diagonal(dim1=1, dim2=2).fill_(torch.inf)
         rows.append(tile.topk(k, dim=2, largest=False).indices)
     return torch.cat(rows, 1)
 

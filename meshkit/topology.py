@@ -3,8 +3,12 @@
 Faces are ``(F, 3)`` integer tensors; a face whose three indices are ``-1`` is padding and contributes nothing anywhere.
 """
 
+import math
+
 import torch
 from torch import Tensor
+
+from meshkit.scatter import segment_sum
 
 __all__ = [
     "check_faces",
@@ -344,6 +348,8 @@ def _doubled_area(corners: Tensor) -> tuple[Tensor, Tensor]:
 
 def _add_at_corners(values: Tensor, faces: Tensor, num_verts: int) -> Tensor:
     """Sum (..., F, 3, D) corner values over the faces around each vertex: (..., V, D)."""
-    lead, dim = values.shape[:-3], values.shape[-1]
-    index = faces.long().clamp_min(0).flatten(-2)[..., None].expand(*lead, -1, dim)
-    return values.new_zeros(*lead, num_verts, dim).scatter_add(-2, index, values.flatten(-3, -2))
+    *lead, _, _, dim = values.shape
+    meshes = math.prod(lead)
+    start = num_verts * torch.arange(meshes, device=faces.device)[:, None, None]
+    index = (faces.long().clamp_min(0) + start).flatten()
+    return segment_sum(values.reshape(-1, dim), index, meshes * num_verts).view(*lead, num_verts, dim)

@@ -47,6 +47,23 @@ def test_query_points(method, tile_elements):
 
 
 @methods
+def test_others_only(method, tile_elements):
+    samples, mask = [rand(n, 3, seed=n) for n in (20, 31, 7)], scattered_mask([20, 31, 7], 33)
+    index = knn(scatter(samples, mask, 0.0), 6, mask=mask, include_self=False, method=method)
+    for b, sample in enumerate(samples):
+        places = mask[b].nonzero()[:, 0]
+        assert torch.equal(index[b, mask[b]], places[brute_force(sample, sample, 7)[:, 1:]])
+    assert mask.gather(1, index.flatten(1)).all()
+
+
+@methods
+def test_others_among_coincident_points(method):
+    index = knn(torch.ones(1, 20, 3), 4, include_self=False, method=method)[0]
+    assert not (index == torch.arange(20)[:, None]).any()
+    assert all(len(set(row)) == 4 for row in index.tolist())
+
+
+@methods
 @pytest.mark.parametrize("garbage", [0.0, 1e20, math.nan, math.inf])
 def test_padded_batch_equals_the_loop(garbage, method, tile_elements):
     """Padding at 0 lies amid the points: it would be a neighbour if it were real."""
@@ -109,6 +126,8 @@ def test_no_gradient_and_leaves_accepted(method):
         ((1, 5, 3), 2, {"query": torch.ones(1, 4, 2)}, r"got \(1, 4, 2\)"),
         ((1, 5, 3), 2, {"mask": torch.ones(1, 4, dtype=torch.bool)}, "mask"),
         ((2, 5, 3), 2, {"mask": torch.ones(1, 5, dtype=torch.bool)}, "mask"),
+        ((1, 5, 3), 5, {"include_self": False}, "k=5 .* has 5 vertices, itself included"),
+        ((1, 5, 3), 2, {"include_self": False, "query": torch.ones(1, 4, 3)}, "leave query out"),
         ((1, 5, 3), 2, {"method": "ball"}, "method must be .* got 'ball'"),
     ],
 )

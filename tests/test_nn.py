@@ -1,5 +1,6 @@
-"""SetConv, its extractor and the residual block against literal transcriptions, one sample at a time."""
+"""SetConv and its extractor against literal transcriptions, one sample at a time."""
 
+import literal_setconv
 import pytest
 import torch
 from conftest import GARBAGE, assert_near, rand, scatter, scattered_mask
@@ -7,8 +8,7 @@ from torch import Tensor, nn
 from torch.autograd import gradcheck
 
 from meshkit.neighbors import knn
-from meshkit.nn import ConditionalResBlock, SetConv, SetConvExtractor
-from meshkit.norm import ElaIN
+from meshkit.nn import SetConv, SetConvExtractor, _edge_mlp
 
 K = 5
 
@@ -20,29 +20,27 @@ def randomise(module: nn.Module, seed: int = 100) -> nn.Module:
     return module
 
 
-def setconv_literally(conv: SetConv, x: Tensor, positions: Tensor, nearest: Tensor, slope: float = 0.1) -> Tensor:
-    """x (N, C), positions (N, 3), nearest (N, k): concatenate, then three times linear, norm over (N, k), LeakyReLU."""
-    relative = (positions[nearest] - positions[:, None]).detach()
-    h = torch.cat([x[nearest], relative], 2)
-    for linear, scale, shift in zip(conv.linears, conv.scales, conv.shifts, strict=True):
-        h = torch.einsum("oc,nkc->nko", linear.weight, h)
-        mean = h.mean((0, 1))
-        variance = ((h - mean) ** 2).mean((0, 1))  # biased, over vertices and neighbours
-        h = scale * (h - mean) / (variance + 1e-5) ** 0.5 + shift
-        h = torch.where(h > 0, h, slope * h)
-    return h.max(1).values
+def setconv_literally(conv: SetConv, x: Tensor, positions: Tensor, nearest: Tensor) -> Tensor:
+    """One sample: x (N, C), positions (N, 3), nearest (N, k)."""
+    return literal_setconv.setconv_literally(conv, x[None], positions[None], nearest[None])[0]
 
 
 def argsort_knn(points: Tensor, k: int) -> Tensor:
-    return torch.cdist(points, points).argsort(1)[:, :k]
+    return literal_setconv.argsort_knn(points[None], k)[0]
 
 
 def extractor_literally(extractor: SetConvExtractor, positions: Tensor, descriptors: Tensor | None = None) -> Tensor:
-    nearest = argsort_knn(positions.detach(), extractor.k)
-    x = positions if descriptors is None else torch.cat([positions, descriptors], 1)
-    for conv in extractor.convs:
-        x = setconv_literally(conv, x, positions, nearest)
-    return x
+    given = None if descriptors is None else descriptors[None]
+    return literal_setconv.extractor_literally(extractor, positions[None], given)[0]
+
+
+@pytest.fixture(params=[_edge_mlp._CPU_BLOCK, 90], ids=["one-block", "many-blocks"])
+def block(request, monkeypatch) -> int:
+    monkeypatch.setattr(_edge_mlp, "_CPU_BLOCK", request.param)
+    return request.param
+
+
+recompute = pytest.mark.parametrize("recompute", [False, True], ids=["kept", "recomputed"])
 
 
 def gradients(value: Tensor, inputs: list[Tensor]) -> tuple[Tensor, ...]:
@@ -52,10 +50,11 @@ def gradients(value: Tensor, inputs: list[Tensor]) -> tuple[Tensor, ...]:
 # SetConv
 
 
-@pytest.mark.parametrize("channels", [1, 3, 6])
+@recompute
+@pytest.mark.parametrize("channels", [1, 6])
 @pytest.mark.parametrize("k", [1, 5, 12])
-def test_setconv_equals_the_equations(k, channels):
-    conv = randomise(SetConv(channels, 7).double())
+def test_setconv_equals_the_equations(k, channels, recompute, block):
+    conv = randomise(SetConv(channels, 7, recompute=recompute).double())
     x, positions = rand(2, 12, channels).requires_grad_(), rand(2, 12, 3, seed=1)
     value = conv(x, positions, knn(positions, k))
     expected = torch.stack(
@@ -83,11 +82,14 @@ def test_setconv_in_float32_and_far_from_the_origin():
 def test_setconv_slope():
     conv = randomise(SetConv(3, 4, slope=0.3).double())
     p = rand(1, 10, 3)
-    assert_near(conv(p, p, knn(p, K))[0], setconv_literally(conv, p[0], p[0], argsort_knn(p[0], K), slope=0.3), 1e-12)
+    assert_near(conv(p, p, knn(p, K))[0], setconv_literally(conv, p[0], p[0], argsort_knn(p[0], K)), 1e-12)
+    with pytest.raises(ValueError, match=r"slope must not be negative.* got -0\.1"):
+        SetConv(3, 4, slope=-0.1)
 
 
-def test_setconv_gradcheck():
-    conv = randomise(SetConv(2, 3).double())
+@recompute
+def test_setconv_gradcheck(recompute):
+    conv = randomise(SetConv(2, 3, recompute=recompute).double())
     positions = rand(2, 6, 3, seed=1)
     mask = torch.tensor([[True] * 6, [True, False, True, True, False, True]])
     neighbors = knn(positions, 3, mask=mask)
@@ -101,9 +103,10 @@ def test_relative_positions_carry_no_gradient():
     assert torch.autograd.grad(value, [x, positions], allow_unused=True)[1] is None
 
 
+@recompute
 @pytest.mark.parametrize("garbage", GARBAGE)
-def test_setconv_padded_batch_equals_the_loop(garbage):
-    conv, sizes = randomise(SetConv(4, 6).double()), [8, 12, 5]
+def test_setconv_padded_batch_equals_the_loop(garbage, recompute, block):
+    conv, sizes = randomise(SetConv(4, 6, recompute=recompute).double()), [8, 12, 5]
     xs = [rand(n, 4, seed=i).requires_grad_() for i, n in enumerate(sizes)]
     ps, mask = [rand(n, 3, seed=i + 9) for i, n in enumerate(sizes)], scattered_mask(sizes, 13)
     x, positions = scatter(xs, mask, garbage).requires_grad_(), scatter(ps, mask, 0.0)
@@ -127,6 +130,84 @@ def test_setconv_is_the_same_in_training_and_evaluation():
     value = conv(p, p, knn(p, K))
     assert torch.equal(conv.eval()(p, p, knn(p, K)), value)
     assert_near(conv(p[:1], p[:1], knn(p[:1], K)), value[:1], 1e-13)
+
+
+@recompute
+def test_what_is_kept_for_the_backward(recompute):
+    """One tensor of N k rows, or none."""
+    conv, p, k = SetConv(3, 16, recompute=recompute), rand(2, 40, 3, dtype=torch.float32), 12
+    kept: dict[int, int] = {}
+    with torch.autograd.graph.saved_tensors_hooks(
+        lambda t: kept.setdefault(t.data_ptr(), t.numel()) and t, lambda t: t
+    ):
+        conv(p, p, knn(p, k))
+    rows = 2 * 40 * k
+    assert [size for size in kept.values() if size >= rows * 3] == ([] if recompute else [rows * 16])
+
+
+def test_statistics_far_from_zero():
+    """Numbers near 100 with deviations near 1: the sum of their squares would lose the variance in float32."""
+    conv, p = randomise(SetConv(3, 8)), rand(1, 60, 3, dtype=torch.float32)
+    for shift in list(conv.shifts)[:2]:
+        shift.data += 100
+    value = conv(p, p, knn(p, K))
+    exact = p[0].double()
+    assert_near(value[0], setconv_literally(conv.double(), exact, exact, argsort_knn(exact, K)), 2e-3)
+
+
+def test_coincident_vertices_share_the_gradient():
+    conv = randomise(SetConv(3, 8).double())
+    p = rand(1, 10, 3).repeat(1, 2, 1)
+    x = p.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(conv(x, p, knn(p, 4)).square().sum(), x)
+    assert_near(gradient[:, :10], gradient[:, 10:], 1e-10)
+    assert gradient.abs().amax() > 1e-3
+
+
+def test_channels_of_scale_zero_are_their_shift():
+    conv, p = randomise(SetConv(3, 4).double()), rand(1, 10, 3)
+    conv.scales[2].data.zero_()
+    expected = nn.functional.leaky_relu(conv.shifts[2], 0.1).expand(1, 10, 4)
+    assert_near(conv(p, p, knn(p, K)), expected, 1e-12)
+
+
+def test_second_derivatives_are_refused():
+    conv, p = SetConv(3, 4).double(), rand(1, 10, 3)
+    x = p.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(conv(x, p, knn(p, K)).square().sum(), x, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+
+
+def test_gradients_of_torch_func():
+    conv, p = randomise(SetConv(3, 4).double()), rand(1, 10, 3)
+    neighbors, parameters = knn(p, K), dict(conv.named_parameters())
+
+    def loss(parameters: dict[str, Tensor]) -> Tensor:
+        return torch.func.functional_call(conv, parameters, (p, p, neighbors)).square().sum()
+
+    got = torch.func.grad(loss)({name: value.detach() for name, value in parameters.items()})
+    for name, truth in zip(parameters, torch.autograd.grad(loss(parameters), list(parameters.values())), strict=True):
+        assert_near(got[name], truth, 1e-12)
+
+
+def test_setconv_compiles_into_one_graph():
+    conv, p = randomise(SetConv(3, 6).double()), rand(2, 12, 3)
+    mask = scattered_mask([12, 8], 12)
+    neighbors, inputs = knn(p, K, mask=mask), [p.clone().requires_grad_(), *conv.parameters()]
+    compiled = torch.compile(conv, fullgraph=True, backend="aot_eager")
+    results = [f(inputs[0], p, neighbors, mask=mask) for f in (compiled, conv)]
+    assert_near(*results, 1e-13)
+    for gradient, truth in zip(*(gradients(y, inputs) for y in results), strict=True):
+        assert_near(gradient, truth, 1e-12)
+
+
+def test_setconv_in_bfloat16():
+    conv, p = SetConv(3, 8), rand(2, 60, 3, dtype=torch.float32)
+    neighbors, exact = knn(p, 8), conv(p, p, knn(p, 8))
+    low = conv.bfloat16()(p.bfloat16(), p.bfloat16(), neighbors)
+    assert low.dtype == torch.bfloat16
+    assert_near(low.float(), exact, 0.1)
 
 
 # The extractor
@@ -194,6 +275,10 @@ def test_extractor_under_autocast():
     with torch.autocast("cpu", torch.bfloat16):
         value = extractor(p, mask=mask)
     assert_near(value.float(), exact, 0.1)
+    inputs = list(extractor.parameters())
+    got, truths = (torch.autograd.grad(y.float().square().mean(), inputs) for y in (value, exact))
+    difference = sum(((a - b) ** 2).sum() for a, b in zip(got, truths, strict=True))
+    assert difference < 0.2**2 * sum((b**2).sum() for b in truths)
 
 
 @pytest.mark.parametrize(
@@ -215,107 +300,3 @@ def test_extractor_error_counts_real_vertices():
     mask = torch.tensor([[True] * 6, [True] * 3 + [False] * 3])
     with pytest.raises(ValueError, match="has 3 vertices"):
         SetConvExtractor((4,), k=4)(rand(2, 6, 3, dtype=torch.float32), mask=mask)
-
-
-# The residual block
-
-C, D = 5, 4
-
-
-def make_block(spectral: bool, **options) -> ConditionalResBlock:
-    block = ConditionalResBlock(C, D, spectral=spectral, **options).double()
-    for i, parameter in enumerate(block.parameters()):
-        parameter.data = 0.4 * rand(*parameter.shape, seed=i)
-    for _ in range(50):  # settle the power iterations on the new weights
-        block(rand(1, 3, C), rand(1, 3, D))
-    return block.eval()
-
-
-def block_literally(block: ConditionalResBlock, x: Tensor, cond: Tensor, slope: float = 0.2) -> Tensor:
-    """Each norm finds its own statistics; x (N, C), cond (N, D)."""
-
-    def act(h: Tensor) -> Tensor:
-        return torch.where(h > 0, h, slope * h)
-
-    x, cond = x[None], cond[None]
-    inner = act(block.norm_0(x, cond)) @ block.conv_0.weight.T + block.conv_0.bias
-    residual = act(block.norm_1(inner, cond)) @ block.conv_1.weight.T + block.conv_1.bias
-    return (act(block.norm_s(x, cond)) @ block.conv_s.weight.T + residual)[0]
-
-
-@pytest.mark.parametrize("spectral", [True, False])
-def test_block_equals_the_equation_without_shared_statistics(spectral):
-    block = make_block(spectral)
-    x, cond = rand(2, 9, C).requires_grad_(), rand(2, 9, D, seed=1).requires_grad_()
-    value = block(x, cond)
-    expected = torch.stack([block_literally(block, a, c) for a, c in zip(x, cond, strict=True)])
-    assert_near(value, expected, 1e-12)
-    inputs = [x, cond, *block.parameters()]
-    for gradient, truth in zip(gradients(value, inputs), gradients(expected, inputs), strict=True):
-        assert_near(gradient, truth, 1e-10)
-
-
-@pytest.mark.parametrize("garbage", GARBAGE)
-def test_block_padded_batch_equals_the_loop(garbage):
-    block, sizes = make_block(True), [6, 9, 1]
-    xs, cs = ([rand(n, c, seed=i + s).requires_grad_() for i, n in enumerate(sizes)] for c, s in ((C, 0), (D, 9)))
-    mask = scattered_mask(sizes, 11)
-    x, cond = (scatter(samples, mask, garbage).requires_grad_() for samples in (xs, cs))
-    value = block(x, cond, mask=mask)[mask]
-    expected = torch.cat([block_literally(block, a, c) for a, c in zip(xs, cs, strict=True)])
-    assert_near(value, expected, 1e-12)
-    parameters = list(block.parameters())
-    got, truths = gradients(value, [x, cond, *parameters]), gradients(expected, [*xs, *cs, *parameters])
-    for gradient, samples in zip(got[:2], (truths[:3], truths[3:6]), strict=True):
-        assert_near(gradient[mask], torch.cat(samples), 1e-10)
-        assert (gradient[~mask] == 0).all()
-    for gradient, truth in zip(got[2:], truths[6:], strict=True):
-        assert_near(gradient, truth, 1e-10)
-
-
-def test_block_gradcheck():
-    block = make_block(True)
-    mask = torch.tensor([[True] * 4, [True, False, True, True]])
-    leaves = [rand(2, 4, C).requires_grad_(), rand(2, 4, D, seed=1).requires_grad_()]
-    assert gradcheck(lambda x, cond: block(x, cond, mask=mask)[mask], leaves)
-
-
-def test_block_slope_and_variant_of_the_norm():
-    block = make_block(False, slope=0.05, norm=lambda c, d: ElaIN(c, d, variant="paper"))
-    x, cond = rand(1, 9, C), rand(1, 9, D, seed=1)
-    assert {norm.variant for norm in (block.norm_0, block.norm_1, block.norm_s)} == {"paper"}
-    assert_near(block(x, cond)[0], block_literally(block, x[0], cond[0], slope=0.05), 1e-12)
-
-
-class ShiftByCondition(nn.Module):
-    """The plainest conditional norm: it has no statistics to share."""
-
-    def __init__(self, num_features: int, cond_features: int) -> None:
-        super().__init__()
-        self.map = nn.Linear(cond_features, num_features)
-
-    def forward(self, x: Tensor, cond: Tensor, *, mask: Tensor | None = None) -> Tensor:
-        return x + self.map(cond)
-
-
-def test_block_takes_any_norm():
-    block = make_block(False, norm=ShiftByCondition)
-    x, cond = rand(1, 9, C), rand(1, 9, D, seed=1)
-    assert_near(block(x, cond)[0], block_literally(block, x[0], cond[0]), 1e-12)
-
-
-def test_spectral_normalisation():
-    plain, normed = make_block(False), make_block(True)
-    for name in ("conv_0", "conv_1", "conv_s"):
-        weight = getattr(normed, name).parametrizations.weight.original
-        assert_near(getattr(normed, name).weight, weight / torch.linalg.matrix_norm(weight, 2), 1e-6)
-        assert isinstance(getattr(plain, name).weight, nn.Parameter)
-    assert normed.conv_s.bias is None and normed.conv_0.bias is not None
-    x, cond = rand(1, 9, C), rand(1, 9, D, seed=1)
-    assert torch.equal(normed(x, cond), normed(x, cond))  # no power iteration in evaluation
-
-
-def test_block_permutation_equivariance():
-    block, order = make_block(True), torch.randperm(9)
-    x, cond = rand(1, 9, C), rand(1, 9, D, seed=1)
-    assert_near(block(x[:, order], cond[:, order]), block(x, cond)[:, order], 1e-12)

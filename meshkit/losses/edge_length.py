@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_faces_match, check_reduction, reduce_samples
+from meshkit.scatter import segment_sum
 from meshkit.topology import unique_edges
 
 __all__ = ["EdgeLengthLoss", "edge_length_loss"]
@@ -56,9 +57,8 @@ def edge_length_loss(
     if mask is not None:
         real = mask.flatten()[tail] & mask.flatten()[head]
         edge = torch.where(real[:, None], edge, 0)
-    sample = tail // num
-    total = edge.new_zeros(batch).index_add(0, sample, edge.square().sum(-1))
-    count = tail.new_zeros(batch).index_add(0, sample, real.to(tail.dtype))
+    terms = torch.stack([edge.square().sum(-1), real.to(edge.dtype)], 1)
+    total, count = segment_sum(terms, tail // num, batch).unbind(1)
     return reduce_samples(2 * total, 2 * count, reduction)
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
-from meshkit.neighbors import knn
+from meshkit.neighbors import gather_vertices, knn
+from meshkit.nn._edge_mlp import EPS, edge_mlp
+from meshkit.scatter import segment_sum
 
 __all__ = ["SetConv", "SetConvExtractor"]
 
@@ -19,17 +22,27 @@ class SetConv(nn.Module):
     .. math:: y_i = \max_{j \in \mathrm{kNN}(i)} \phi_3\,\phi_2\,\phi_1\,[x_j,\; p_j - p_i], \qquad
               \phi_l(h) = \mathrm{LeakyReLU}_{0.1}(\mathrm{InstanceNorm}(W_l h))
 
-    with statistics over all (vertex, neighbour) pairs of a sample. The first linear map is split,
-    :math:`W_1 [x_j, p_j - p_i] = (W_x x_j + W_p p_j) - W_p p_i`: N products instead of N k. The relative positions
-    carry no gradient.
+    with statistics over all (vertex, neighbour) pairs of a sample. The relative positions carry no gradient.
+
+    The evaluation is exact but not literal. The first linear map is split, :math:`W_1 [x_j, p_j - p_i] = (W_x x_j +
+    W_p p_j) - W_p p_i`: N products instead of N k. The statistics of its result follow from the covariance of
+    :math:`[x_j, p_j - p_i]`, so that the first norm is part of the map. The last norm and activation come after the
+    maximum (a negative scale turns the sign of its row of :math:`W_3` first). What is left goes through blocks of
+    vertices, and so does the hand-written gradient, which has no derivative of its own. Under autocast the products of
+    the N k rows are in low precision, statistics and the rest in float32. torch.compile traces the layer as one graph.
 
     Args:
         in_features: channels of ``x``.
         out_features: channels of the result.
-        slope: of the LeakyReLU.
+        slope: of the LeakyReLU, not negative.
+        recompute: hold nothing of size N k between forward and backward, nor within them, at 1.7 times the matrix
+            products; else one tensor ``(B, N k, out_features)`` is kept for the backward.
 
     Shape:
         ``x (B, N, C)``, ``positions (B, N, 3)``, ``neighbors (B, N, k)`` int64; the result is ``(B, N, out_features)``.
+
+    Raises:
+        ValueError: negative slope.
 
     Reference:
         X-DualNet, "Network architecture" (pointnet++-like conv). Layer sizes as in the released code, which takes the
@@ -41,50 +54,93 @@ class SetConv(nn.Module):
         torch.Size([2, 50, 16])
     """
 
-    def __init__(self, in_features: int, out_features: int, *, slope: float = 0.1) -> None:
+    def __init__(self, in_features: int, out_features: int, *, slope: float = 0.1, recompute: bool = False) -> None:
         super().__init__()
-        self.slope, self.in_features, self.out_features = slope, in_features, out_features
+        if not slope >= 0:
+            raise ValueError(f"slope must not be negative (the maximum is taken before the activation), got {slope}")
+        self.slope, self.in_features, self.out_features, self.recompute = slope, in_features, out_features, recompute
         widths = [in_features + 3, out_features, out_features, out_features]
         self.linears = nn.ModuleList(nn.Linear(i, o, bias=False) for i, o in pairwise(widths))
         self.scales = nn.ParameterList(nn.Parameter(torch.ones(out_features)) for _ in self.linears)
         self.shifts = nn.ParameterList(nn.Parameter(torch.zeros(out_features)) for _ in self.linears)
 
-    def forward(self, x: Tensor, positions: Tensor, neighbors: Tensor, *, mask: Tensor | None = None) -> Tensor:
+    def forward(
+        self, x: Tensor, positions: Tensor, neighbors: Tensor | Neighborhoods, *, mask: Tensor | None = None
+    ) -> Tensor:
         """Convolve ``x`` at ``positions`` over ``neighbors``; ``mask`` is ``(B, N)``, True = real vertex."""
-        if mask is not None:
-            x, positions = (t.masked_fill(~mask[..., None], 0.0) for t in (x, positions))
-        to_features, to_position = self.linears[0].get_parameter("weight").split([self.in_features, 3], 1)
-        offset = nn.functional.linear(positions.detach(), to_position)
-        lifted = nn.functional.linear(x, to_features) + offset
-        # One sample at a time: instance norm is then the native batch norm over rows, padding is cut off instead of
-        # masked, and tensors of N k rows stay small enough for the cache.
-        rows = [self._convolve(*sample) for sample in _samples(mask, lifted, offset, neighbors)]
-        if mask is None:
-            return torch.stack(rows)
-        out = x.new_zeros(*mask.shape, self.out_features, dtype=rows[0].dtype)
-        return out.masked_scatter(mask[..., None], torch.cat(rows))
+        graph = neighbors if isinstance(neighbors, Neighborhoods) else neighborhoods(positions, neighbors, mask)
+        kind = x.device.type
+        products = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else x.dtype
+        with torch.autocast(kind, enabled=False):
+            w1, w2, w3 = (cast(nn.Linear, linear).weight for linear in self.linears)
+            u, v = self._first(x if graph.mask is None else x.masked_fill(~graph.mask[..., None], 0.0), w1, graph)
+            sign = torch.where(self.scales[2] < 0, -1, 1).to(w3)
+            best, mean, variance = edge_mlp(
+                *(u, v, w2, self.scales[1], self.shifts[1], sign[:, None] * w3, graph.neighbors, graph.mask),
+                slope=self.slope,
+                recompute=self.recompute,
+                dtype=products,
+            )
+            scale = sign * self.scales[2] * (variance + EPS).rsqrt()
+            y = torch.addcmul((self.shifts[2] - scale * mean)[:, None], best, scale[:, None])
+            y = nn.functional.leaky_relu(y, self.slope)
+            return (y if graph.mask is None else y.masked_fill(~graph.mask[..., None], 0.0)).to(x.dtype)
 
-    def _convolve(self, lifted: Tensor, offset: Tensor, neighbors: Tensor) -> Tensor:
-        h = lifted.index_select(0, neighbors.flatten()).view(*neighbors.shape, -1) - offset[:, None]
-        h = self._normalise(h.flatten(0, 1), 0)
-        for layer in range(1, len(self.linears)):
-            h = self._normalise(self.linears[layer](h), layer)
-        return h.view(*neighbors.shape, -1).amax(1)
+    def _first(self, x: Tensor, weight: Tensor, graph: Neighborhoods) -> tuple[Tensor, Tensor]:
+        """``u`` and ``v`` of the normalised first layer, u_j - v_i."""
+        x, weight = x.to(graph.positions), weight.to(graph.positions)
+        degree, rows = graph.degree[..., None], graph.rows[:, None, None]
+        mean = (degree * x).sum(1, keepdim=True) / rows
+        x = x - mean
+        mixed = x.mT @ graph.offsets / rows
+        covariance = torch.cat(
+            [torch.cat([x.mT @ (degree * x) / rows, mixed], 2), torch.cat([mixed.mT, graph.covariance], 2)], 1
+        )
+        variance = ((weight @ covariance) * weight).sum(2).clamp_min(0)
+        scale = self.scales[0] * (variance + EPS).rsqrt()
+        folded = (scale[..., None] * weight).mT
+        to_position = folded[:, self.in_features :]
+        shift = self.shifts[0] - graph.mean @ to_position
+        u = torch.baddbmm(shift, torch.cat([x, graph.positions], 2), folded)
+        return u, graph.positions @ to_position
 
-    def _normalise(self, h: Tensor, layer: int) -> Tensor:
-        scale, shift = self.scales[layer], self.shifts[layer]
-        h = nn.functional.batch_norm(h, None, None, scale, shift, training=True, momentum=0.0, eps=1e-5)
-        return nn.functional.leaky_relu(h, self.slope, inplace=True)
+
+class Neighborhoods(NamedTuple):
+    """A kNN graph and the moments of its relative positions d = p_j - p_i."""
+
+    positions: Tensor  # (B, N, 3), about their mean; at least float32
+    neighbors: Tensor  # (B, N, k)
+    mask: Tensor | None
+    rows: Tensor  # (B,), number of (vertex, neighbour) pairs
+    degree: Tensor  # (B, N), in how many neighbourhoods each vertex is
+    offsets: Tensor  # (B, N, 3), sum over these of d, less the mean of d each
+    mean: Tensor  # (B, 1, 3), of d
+    covariance: Tensor  # (B, 3, 3), of d
 
 
-def _samples(mask: Tensor | None, *tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """The real rows of each sample. Padding may stand anywhere; neighbours are re-numbered to match."""
-    for b, sample in enumerate(zip(*tensors, strict=True)):
-        if mask is None:
-            yield sample
-        else:
-            *values, neighbors = (t[mask[b]] for t in sample)
-            yield *values, (mask[b].cumsum(0) - 1)[neighbors]
+@torch.no_grad()
+def neighborhoods(positions: Tensor, neighbors: Tensor, mask: Tensor | None) -> Neighborhoods:
+    """What :class:`SetConv` needs to know of its graph."""
+    positions = positions.to(torch.promote_types(positions.dtype, torch.float32))
+    batch, num, k = neighbors.shape
+    if mask is None:
+        real = positions.new_ones(batch, num, 1)
+    else:
+        real = mask[..., None].to(positions)
+        positions = positions.masked_fill(~mask[..., None], 0.0)
+    count = real.sum(1, keepdim=True)
+    positions = (positions - positions.sum(1, keepdim=True) / count) * real
+    rows = k * count
+    relative = (gather_vertices(positions, neighbors) - positions[:, :, None]) * real[..., None]
+    mean = relative.sum((1, 2))[:, None] / rows
+    flat = relative.flatten(1, 2)
+    covariance = flat.mT @ flat / rows - mean.mT @ mean
+    start = num * torch.arange(batch, device=neighbors.device)[:, None, None]
+    ones = real[..., None].expand(-1, -1, k, 1)
+    sums = segment_sum(torch.cat([relative, ones], 3).view(-1, 4), (neighbors + start).flatten(), batch * num)
+    offsets, degree = sums.view(batch, num, 4).split([3, 1], 2)
+    offsets = offsets - degree * mean
+    return Neighborhoods(positions, neighbors, mask, rows[:, 0, 0], degree[..., 0], offsets, mean, covariance)
 
 
 class SetConvExtractor(nn.Module):
@@ -94,6 +150,7 @@ class SetConvExtractor(nn.Module):
         widths: channels of the convolutions; the paper has 32, 64, 128.
         k: neighbours of each vertex, itself included; the released code has 32.
         descriptors: number of descriptor channels appended to the coordinates at the input.
+        recompute: as in :class:`SetConv`.
 
     Shape:
         ``positions (B, N, 3)``, ``descriptors (B, N, D)`` or ``None``, ``mask (B, N)``; result ``(B, N, widths[-1])``.
@@ -106,11 +163,13 @@ class SetConvExtractor(nn.Module):
         torch.Size([1, 30, 16])
     """
 
-    def __init__(self, widths: Sequence[int] = (32, 64, 128), *, k: int = 32, descriptors: int = 0) -> None:
+    def __init__(
+        self, widths: Sequence[int] = (32, 64, 128), *, k: int = 32, descriptors: int = 0, recompute: bool = False
+    ) -> None:
         super().__init__()
         self.k, self.descriptors, self.out_features = k, descriptors, widths[-1]
         inputs = [3 + descriptors, *widths[:-1]]
-        self.convs = nn.ModuleList(SetConv(i, o) for i, o in zip(inputs, widths, strict=True))
+        self.convs = nn.ModuleList(SetConv(i, o, recompute=recompute) for i, o in zip(inputs, widths, strict=True))
 
     def forward(self, positions: Tensor, *, descriptors: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Features of each vertex."""
@@ -122,12 +181,12 @@ class SetConvExtractor(nn.Module):
             )
         if mask is not None:
             positions = positions.masked_fill(~mask[..., None], 0.0)
-        neighbors = knn(positions, self.k, mask=mask)
+        graph = neighborhoods(positions, knn(positions, self.k, mask=mask), mask)
         x = positions
         if descriptors is not None:
             if mask is not None:
                 descriptors = descriptors.masked_fill(~mask[..., None], 0.0)
             x = torch.cat([positions, descriptors.to(positions.dtype)], 2)
         for conv in self.convs:
-            x = conv(x, positions, neighbors, mask=mask)
+            x = conv(x, positions, graph, mask=mask)
         return x
