@@ -6,18 +6,17 @@ from typing import Any
 
 import torch
 from _run import Run
-from torch import Tensor
+from torch import Tensor, nn
 
 from meshkit.batching import center
 from meshkit.data import PairBatch, PosePairs
 from meshkit.io import save_mesh
 from meshkit.metrics import chamfer_distance, correspondence_error, pmd
-from meshkit.models import PoseTransferGenerator
 from meshkit.viz import contact_sheet, error_colors, plot_curves, render
 
 
 @torch.no_grad()
-def evaluate(generator: PoseTransferGenerator, pairs: PosePairs, device: torch.device, count: int) -> dict[str, float]:
+def evaluate(generator: nn.Module, pairs: PosePairs, device: torch.device, count: int) -> dict[str, float]:
     """Means over ``count`` unseen pairs, of the output and of two baselines; PMD and Chamfer in 1e-3 square metres."""
     training = generator.training
     generator.eval()
@@ -25,17 +24,20 @@ def evaluate(generator: PoseTransferGenerator, pairs: PosePairs, device: torch.d
     for start in range(0, count, 4):
         batch = pairs[[(0, i) for i in range(start, min(start + 4, count))]].to(device)
         result = generate(generator, batch)
-        candidates = {"": result.vertices, "_copy_identity": batch.identity, "_copy_warped": result.warped}
+        candidates = {"": result.vertices, "_copy_identity": batch.identity}
+        if result.warped is not None:
+            candidates["_copy_warped"] = result.warped
         for name, verts in candidates.items():
             columns.setdefault(f"pmd{name}", []).append(1e3 * pmd(verts, batch.ground_truth))
             columns.setdefault(f"chamfer{name}", []).append(1e3 * chamfer_distance(center(verts), batch.ground_truth))
-        matched = correspondence_error(result.plan.argmax(), batch.pose, batch.correspondence)
-        columns.setdefault("correspondence_m", []).append(matched)
+        if result.plan is not None:
+            matched = correspondence_error(result.plan.argmax(), batch.pose, batch.correspondence)
+            columns.setdefault("correspondence_m", []).append(matched)
     generator.train(training)
     return {name: round(float(torch.cat(values).mean()), 4) for name, values in columns.items()}
 
 
-def generate(generator: PoseTransferGenerator, batch: PairBatch) -> Any:
+def generate(generator: nn.Module, batch: PairBatch) -> Any:
     return generator(
         batch.identity,
         batch.pose,
@@ -44,9 +46,7 @@ def generate(generator: PoseTransferGenerator, batch: PairBatch) -> Any:
     )
 
 
-def report(
-    run: Run, generator: PoseTransferGenerator, pairs: PosePairs, device: torch.device, facts: dict[str, Any]
-) -> None:
+def report(run: Run, generator: nn.Module, pairs: PosePairs, device: torch.device, facts: dict[str, Any]) -> None:
     """Evaluate on unseen pairs; write summary.json, curves.png, sheet.png and meshes/."""
     figures = evaluate(generator, pairs, device, len(pairs))
     summary = {
@@ -63,8 +63,10 @@ def report(
     draw_sheet(run, generator, pairs, device)
     print(f"\n{len(pairs)} unseen pairs        PMD e-3   Chamfer e-3")
     for title, key in (("copy the identity", "_copy_identity"), ("copy the warped", "_copy_warped"), ("output", "")):
-        print(f"  {title:<20} {figures[f'pmd{key}']:8.2f}   {figures[f'chamfer{key}']:8.2f}")
-    print(f"matched vertices are {100 * figures['correspondence_m']:.1f} cm from the true ones on average")
+        if f"pmd{key}" in figures:
+            print(f"  {title:<20} {figures[f'pmd{key}']:8.2f}   {figures[f'chamfer{key}']:8.2f}")
+    if "correspondence_m" in figures:
+        print(f"matched vertices are {100 * figures['correspondence_m']:.1f} cm from the true ones on average")
     print(f"pictures, meshes and figures: {run.folder}")
 
 
@@ -93,14 +95,13 @@ def draw_curves(run: Run) -> None:
 
 
 @torch.no_grad()
-def draw_sheet(
-    run: Run, generator: PoseTransferGenerator, pairs: PosePairs, device: torch.device, rows: int = 6
-) -> None:
+def draw_sheet(run: Run, generator: nn.Module, pairs: PosePairs, device: torch.device, rows: int = 6) -> None:
     rows = min(rows, len(pairs))
     batch = pairs[[(0, i) for i in range(rows)]].to(device)
     generator.eval()
     result = generate(generator, batch)
-    output, warped = center(result.vertices), center(result.warped)
+    output = center(result.vertices)
+    warped = output if result.warped is None else center(result.warped)
     worst, sheet, captions = 0.15, [], []
     for b in range(rows):
         faces, truth = batch.identity_faces[b], batch.ground_truth[b]

@@ -32,7 +32,7 @@ from meshkit.consistency import DualReconstruction
 from meshkit.data import PairBatch, PairSampler, pair_loader
 from meshkit.deform import ARAPDeformer
 from meshkit.losses import backward_correspondence_loss, edge_length_loss, edge_ratio_loss, reconstruction_loss
-from meshkit.models import GeneratorConfig, PoseTransferGenerator
+from meshkit.models import NPT, GeneratorConfig, PoseTransferGenerator
 from meshkit.models.presets import PRESETS as MODELS
 
 
@@ -149,7 +149,7 @@ PRESETS = {
 }
 
 
-def build(cfg: Config) -> tuple[PoseTransferGenerator, torch.nn.Module]:
+def build(cfg: Config) -> tuple[PoseTransferGenerator | NPT, torch.nn.Module]:
     """The generator, and what is trained around it."""
     generator = cfg.model.build()
     if cfg.supervised:
@@ -171,12 +171,13 @@ def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, *, arap: bool) 
         # O = G(A, B);  Ô = ARAP(A, O);  A' = G(Ô, A) ≈ A;  B' = G(B, Ô) ≈ B
         result = system(batch.identity, batch.pose, identity_faces=batch.identity_faces, use_deform=arap, **descriptors)
         output = result.output
-        back = backward_correspondence_loss(result.plan, result.target_b, normalization=cfg.corr_normalization)
         losses = {
             "rec_a": cfg.lambda_rec * reconstruction_loss(result.reconstruction_a, result.target_a),
             "rec_b": cfg.lambda_rec * reconstruction_loss(result.reconstruction_b, result.target_b),
-            "corr": cfg.lambda_corr * back,
         }
+        if result.plan is not None:  # NPT has no correspondence
+            back = backward_correspondence_loss(result.plan, result.target_b, normalization=cfg.corr_normalization)
+            losses["corr"] = cfg.lambda_corr * back
     if cfg.edge == "ratio":
         losses["edge"] = cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces)
     else:

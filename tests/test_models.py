@@ -11,12 +11,20 @@ from conftest import GARBAGE, assert_near, rand, scatter, scattered_mask
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from meshkit.consistency import DualReconstruction
+from meshkit.losses import backward_correspondence_loss
 from meshkit.models import (
+    NPT,
     GeneratorConfig,
     GeneratorOutput,
+    OrderedPoseTransferStack,
+    PointwiseExtractor,
     PoseTransferGenerator,
     PoseTransferStack,
+    corenet3d,
+    export_onnx,
     load_generator,
+    npt,
     xdualnet,
 )
 
@@ -129,6 +137,9 @@ def test_permuting_the_pose_changes_the_columns_of_the_plan_alone():
         {"descriptors": 2, "residual": True},
         {"descriptors": 2, "condition": "descriptors"},
         {"normalize_plan": False},
+        {"extractor": "pointwise", "extractor_blocks": 2, "eps": 0.3},
+        {"extractor": "pointwise", "extractor_blocks": 1, "eps": 0.3, "descriptors": 2},
+        {"released": True, "residual": True},
     ],
 )
 @pytest.mark.parametrize("garbage", GARBAGE)
@@ -197,6 +208,264 @@ def test_descriptors_are_standardised_and_bounded():
     assert_near(net.encode(verts, descriptors=spiked), net.encode(verts, descriptors=bounded), 1e-12)
 
 
+# 3D-CoreNet: pointwise extractor, theta and phi
+
+
+def test_pointwise_extractor_equals_its_equation():
+    torch.manual_seed(0)
+    net = PointwiseExtractor((4, 6), blocks=2, descriptors=1).double()
+    for block in net.blocks:
+        block.prelu.weight.data.uniform_(-0.5, 0.5)
+    verts, descriptors = rand(2, 11, 3), rand(2, 11, 1, seed=1)
+
+    def norm(x: Tensor) -> Tensor:
+        return nn.functional.instance_norm(x.mT, eps=1e-5).mT
+
+    x = torch.cat([verts, descriptors], 2)
+    x = norm(net.linears[1](nn.functional.leaky_relu(norm(net.linears[0](x)), 0.2)))
+    x = x / x.norm(dim=2, keepdim=True)
+    for block in net.blocks:
+        h = norm(block.conv_1(block.prelu(norm(block.conv_0(x)))))
+        x = block.prelu(x + h)
+    assert_near(net(verts, descriptors=descriptors), x, 1e-10)
+
+
+def test_pointwise_errors():
+    net = PointwiseExtractor((4,), blocks=0, descriptors=1)
+    with pytest.raises(ValueError, match="takes 1 descriptor channels, got 0"):
+        net(torch.zeros(1, 5, 3))
+    with pytest.raises(ValueError, match=r"positions must have shape \(B, N, 3\)"):
+        net(torch.zeros(5, 3))
+    with pytest.raises(ValueError, match="mask must have shape"):
+        net(torch.zeros(1, 5, 3), descriptors=torch.zeros(1, 5, 1), mask=torch.ones(1, 4, dtype=torch.bool))
+    with pytest.raises(ValueError, match='extractor must be "setconv" or "pointwise", got \'dgcnn\''):
+        PoseTransferGenerator(extractor="dgcnn")
+
+
+def test_theta_and_phi_stand_before_the_matching():
+    net, identity, pose = make(extractor="pointwise", eps=0.3), rand(1, 12, 3), rand(1, 17, 3, seed=1)
+    f_id, f_pose = net.encode(identity), net.encode(pose)
+    cosine = nn.functional.cosine_similarity(net.theta(f_id)[:, :, None], net.phi(f_pose)[:, None], dim=3)
+    plan = net(identity, pose).plan.dense()
+    # Scalings apart, the logarithm of the plan is the cosine over eps: its mixed differences are free of them.
+    for value, scale in ((plan.log(), 0.3), (cosine, 1.0)):
+        mixed = scale * (value - value[:, :1] - value[:, :, :1] + value[:, :1, :1])
+        expected = mixed if scale == 0.3 else expected  # noqa: F821
+    assert_near(mixed, expected, 1e-8)
+
+
+# NPT
+
+
+def make_npt(variant: str = "maxpool") -> NPT:
+    """A small float64 NPT whose output is far from zero."""
+    torch.manual_seed(0)
+    net = NPT(variant, encoder_widths=(4, 5, 9)).double()
+    for name, parameter in net.named_parameters():
+        if parameter.dim() == 1 or name.startswith("decoder.narrow"):
+            parameter.data = rand(*parameter.shape)
+    return net.eval()
+
+
+def test_npt_is_a_generator_without_correspondence():
+    result = make_npt()(rand(2, 12, 3), rand(2, 17, 3, seed=1))
+    assert isinstance(result, GeneratorOutput) and result.vertices.shape == (2, 12, 3)
+    assert result.warped is None and result.plan is None
+
+
+def test_npt_takes_given_features():
+    net, identity, pose = make_npt(), rand(2, 12, 3), rand(2, 17, 3, seed=1)
+    features = net.encode(pose)
+    assert features.shape == (2, 17, 9)
+    given = net(identity, pose, identity_features=net.encode(identity), pose_features=features)
+    assert torch.equal(given.vertices, net(identity, pose).vertices)
+
+
+def test_npt_maxpool_ignores_the_order_of_the_pose_and_follows_that_of_the_identity():
+    net, identity, pose, order = make_npt(), rand(2, 12, 3), rand(2, 17, 3, seed=1), torch.randperm(12)
+    expected = net(identity, pose).vertices
+    assert_near(net(identity, pose[:, torch.randperm(17)]).vertices, expected, 1e-12)
+    assert_near(net(identity[:, order], pose).vertices, expected[:, order], 1e-12)
+
+
+@pytest.mark.parametrize("garbage", GARBAGE)
+@pytest.mark.parametrize("variant", ["maxpool", "original"])
+def test_npt_padded_batch_equals_the_loop(variant, garbage):
+    net, sizes = make_npt(variant), [8, 11]
+    pose_sizes = sizes if variant == "original" else [9, 6]
+    ids, poses = [rand(n, 3, seed=n) for n in sizes], [rand(n, 3, seed=n + 50) for n in pose_sizes]
+    id_mask = scattered_mask(sizes, 13)
+    pose_mask = id_mask if variant == "original" else scattered_mask(pose_sizes, 10, seed=1)
+    identity, pose = (scatter(s, m, garbage).requires_grad_() for s, m in ((ids, id_mask), (poses, pose_mask)))
+    vertices = net(identity, pose, identity_mask=id_mask, pose_mask=pose_mask).vertices
+    total = torch.cat([net(i[None], p[None]).vertices[0] for i, p in zip(ids, poses, strict=True)])
+    assert_near(vertices[id_mask], total, 1e-10)
+    assert (vertices[~id_mask] == 0).all()
+    upstream, parameters = rand(19, 3, seed=99), list(net.parameters())
+    got = torch.autograd.grad(vertices[id_mask], [identity, pose, *parameters], upstream)
+    truths = torch.autograd.grad(total, parameters, upstream)
+    for gradient, mask in zip(got[:2], (id_mask, pose_mask), strict=True):
+        assert gradient.isfinite().all() and (gradient[~mask] == 0).all()
+    for gradient, truth in zip(got[2:], truths, strict=True):
+        assert_near(gradient, truth, 1e-8, scale=max(1.0, truth.abs().amax().item()))
+
+
+@pytest.mark.parametrize("variant", ["maxpool", "original"])
+def test_npt_inert_parameters_are_those_without_gradient(variant):
+    net = make_npt(variant)
+    net(rand(2, 12, 3), rand(2, 12, 3, seed=1)).vertices.square().sum().backward()
+    sizes = {n: p.grad.abs().amax().item() for n, p in net.named_parameters()}
+    assert {name for name, size in sizes.items() if size < 1e-10} == set(net.inert_parameters())
+
+
+@pytest.mark.parametrize("variant", ["maxpool", "original"])
+@pytest.mark.parametrize("points", [None, 7])
+def test_npt_in_dual_reconstruction(variant, points):
+    net, a, b = make_npt(variant), rand(2, 12, 3), rand(2, 12, 3, seed=1)
+    dual = DualReconstruction(net, points=points)
+    if variant == "original" and points is not None:
+        with pytest.raises(ValueError, match="needs equal vertex counts, got 12 and 7"):
+            dual(a, b)
+        return
+    result = dual(a, b)
+    assert_near(result.output, net(a, b).vertices, 1e-12)
+    assert result.plan is None and result.warped is None
+    if points is None:
+        assert_near(result.reconstruction_a, net(result.output, a).vertices, 1e-12)
+    assert result.reconstruction_b.shape == (2, points or 12, 3)
+
+
+def test_npt_errors():
+    net, mesh = make_npt("original"), rand(2, 9, 3)
+    with pytest.raises(ValueError, match='variant must be "maxpool" or "original", got \'mean\''):
+        NPT("mean")
+    with pytest.raises(ValueError, match=r"encoder_widths must be positive, got \(3, 0\)"):
+        NPT(encoder_widths=(3, 0))
+    with pytest.raises(ValueError, match="identity and pose batches differ"):
+        net(mesh, mesh[:1])
+    with pytest.raises(ValueError, match=r'equal vertex counts, got 9 and 8: use variant="maxpool"'):
+        net(mesh, mesh[:, :8])
+    with pytest.raises(ValueError, match="NPT takes no descriptors"):
+        net(mesh, mesh, pose_descriptors=mesh)
+    with pytest.raises(ValueError, match="NPT takes no descriptors"):
+        net.encode(mesh, descriptors=mesh)
+    with pytest.raises(ValueError, match="NPT takes no descriptors"):
+        net.fit_descriptors(mesh)
+    with pytest.raises(ValueError, match=r"verts must have shape \(B, N, 3\)"):
+        net.encode(mesh[..., :2])
+
+
+# The released layout's first convolution
+
+
+def test_ordered_stack_begins_with_a_convolution_along_the_order():
+    """The lift against ``conv1d`` of kernel 3, for a batch whose padding stands anywhere."""
+    torch.manual_seed(0)
+    stack, plain = (s(4, (6,), spectral=False).double() for s in (OrderedPoseTransferStack, PoseTransferStack))
+    plain.load_state_dict({**stack.state_dict(), "lift.weight": torch.zeros(6, 3)})
+    sizes = [7, 9]
+    mask = scattered_mask(sizes, 11)
+    samples = [rand(n, 3, seed=n) for n in sizes]
+    features = [rand(n, 4, seed=n + 9) for n in sizes]
+    result = stack(scatter(samples, mask, 0.0), scatter(features, mask, 0.0), mask=mask)
+    kernel = stack.lift.weight.unflatten(1, (3, 3)).mT  # taps last
+    for b, (sample, feature) in enumerate(zip(samples, features, strict=True)):
+        x = nn.functional.conv1d(sample.mT[None], kernel, stack.lift.bias, padding=1).mT
+        x = stack.narrow[0](stack.blocks[0](stack.mix(x), feature[None]))
+        assert_near(result[b][mask[b]], 2 * x[0].tanh(), 1e-10)
+        assert_near(stack(sample[None], feature[None])[0], 2 * x[0].tanh(), 1e-10)
+
+
+def test_ordered_stack_depends_on_the_order():
+    net, plain = make(released=True), make()
+    identity, pose, order = rand(1, 12, 3), rand(1, 17, 3, seed=1), torch.randperm(12)
+    for model, equivariant in ((net, False), (plain, True)):
+        change = model(identity[:, order], pose).vertices - model(identity, pose).vertices[:, order]
+        assert (change.norm() < 1e-8) == equivariant
+
+
+def test_released_matching_reads_like_a_plan():
+    """Where features are alike, the constant in the denominators is lost in rounding: the two plans agree."""
+    net, identity, pose = make(released=True), rand(2, 12, 3), rand(2, 17, 3, seed=1)
+    plain = make()
+    plain.extractor.load_state_dict(net.extractor.state_dict())
+    plan, expected = net(identity, pose).plan, plain(identity, pose).plan
+    assert plan.shape == (2, 12, 17) and plan.T.shape == (2, 17, 12) and plan.dtype == torch.float64
+    values, back = rand(2, 17, 4), rand(2, 12, 4)
+    for read in (
+        lambda p: p.dense(),
+        lambda p: p @ values,
+        lambda p: p.T @ back,
+        lambda p: p.barycentric(values),
+        lambda p: p.row_sums(),
+        lambda p: p.marginals()[1],
+    ):
+        assert_near(read(plan), read(expected), 1e-5)
+    assert torch.equal(plan.argmax(), expected.argmax()) and torch.equal(plan.argmax(1), expected.argmax(1))
+    assert_near(backward_correspondence_loss(plan, pose), backward_correspondence_loss(plan.dense(), pose), 1e-10)
+
+
+# Every default preset
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        *(
+            pytest.param(lambda f=f, s=s: f(s), id=f"{f.__name__}-{s}")
+            for f in (xdualnet, corenet3d)
+            for s in ("paper", "tiny")
+        ),
+        *(
+            pytest.param(lambda v=v, s=s: npt(v, preset=s), id=f"npt-{v}-{s}")
+            for v in ("maxpool", "original")
+            for s in ("paper", "tiny")
+        ),
+    ],
+)
+def test_presets_are_permutation_equivariant(build):
+    torch.manual_seed(0)
+    net = build().double().eval()
+    last = (net.decoder if isinstance(net, NPT) else net.transfer).narrow[-1]
+    last.weight.data = rand(*last.weight.shape) / last.in_features**0.5
+    identity, pose, order, other = 0.4 * rand(1, 40, 3), 0.4 * rand(1, 40, 3, seed=1), *map(torch.randperm, (40, 40))
+    extra, moved = {}, {}
+    if getattr(net, "match_size", False):
+        extra = {f"{n}_descriptors": rand(1, 40, 17, seed=s) for s, n in enumerate(("identity", "pose"))}
+    if isinstance(net, NPT) and net.variant == "original":
+        other = order  # it pairs vertices by their index
+    if extra:
+        moved = {n: d[:, order if n.startswith("identity") else other] for n, d in extra.items()}
+    expected = net(identity, pose, **extra).vertices
+    assert expected.abs().amax() > 0.1
+    assert_near(net(identity[:, order], pose[:, other], **moved).vertices, expected[:, order], 1e-9)
+
+
+# ONNX
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_onnx_export_equals_the_stack(tmp_path):
+    runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
+    pytest.importorskip("onnxscript", reason="onnxscript is not installed")
+    torch.manual_seed(0)
+    net = PoseTransferStack(5, (16,), residual=True).eval()
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    export_onnx(net, tmp_path / "stack.onnx")
+    assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
+    session = runtime.InferenceSession(str(tmp_path / "stack.onnx"), providers=["CPUExecutionProvider"])
+    for batch, vertices in ((1, 30), (3, 17)):
+        warped, features = (rand(batch, vertices, c, seed=c, dtype=torch.float32) for c in (3, 5))
+        (result,) = session.run(None, {"warped": warped.numpy(), "features": features.numpy()})
+        assert_near(torch.from_numpy(result), net(warped, features).detach(), 1e-5)
+
+
+def test_onnx_export_names_the_missing_extra(monkeypatch, tmp_path):
+    monkeypatch.setattr("meshkit.models.export.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r'pip install "meshkit-torch\[onnx\]"'):
+        export_onnx(PoseTransferStack(5, (4,)), tmp_path / "stack.onnx")
+
+
 # Conditioning on descriptors alone
 
 
@@ -229,14 +498,28 @@ def test_condition_errors():
 # Training
 
 
-@pytest.mark.parametrize("options", [{}, {"spectral": False, "residual": True}, {"descriptors": 2}])
+def inert_names(net: nn.Module) -> set[str]:
+    """Full names of what the modules in ``net`` declare as without effect."""
+    return {
+        f"{prefix}.{name}".lstrip(".")
+        for prefix, module in net.named_modules()
+        if hasattr(module, "inert_parameters")
+        for name in module.inert_parameters()
+    }
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"spectral": False, "residual": True}, {"descriptors": 2}, {"extractor": "pointwise"}]
+)
 def test_gradients_reach_every_parameter(options):
     net = make(**options).train()
     extra = {f"{n}_descriptors": rand(2, 12, 2) for n in ("identity", "pose")} if "descriptors" in options else {}
     net(rand(2, 12, 3), rand(2, 12, 3, seed=1), **extra).vertices.square().sum().backward()
+    inert = inert_names(net)
+    assert len(inert) == (2 + 4 * 2 if "extractor" in options else 0)
     for name, parameter in net.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.isfinite().all() and parameter.grad.abs().amax() > 1e-9, name
+        assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+        assert (parameter.grad.abs().amax() > 1e-9) == (name not in inert), name
 
 
 @pytest.mark.parametrize("residual", [False, True])
@@ -263,7 +546,7 @@ def test_half_precision_autocast_gives_float32_vertices():
     with torch.autocast("cpu", torch.bfloat16):
         result = net(identity, pose)
     assert result.vertices.dtype == torch.float32 and result.vertices.isfinite().all()
-    assert result.plan.kernel.dtype == torch.float32
+    assert result.plan.dtype == torch.float32
     assert (result.vertices - exact.vertices).square().mean().sqrt() < 0.2
 
 
@@ -296,8 +579,17 @@ def test_presets():
     assert paper.extractor.descriptors == 0 and paper.condition == "features" and not paper.transfer.residual
     assert tiny.extractor.descriptors == GeneratorConfig().num_signatures + 1 and tiny.condition == "descriptors"
     assert elements(tiny) < elements(paper) / 10
-    with pytest.raises(ValueError, match=r"preset must be one of \['paper', 'tiny'\], got 'huge'"):
-        xdualnet("huge")
+    corenet = corenet3d()
+    assert [m.out_features for m in corenet.extractor.linears] == [64, 128, 256] and len(corenet.extractor.blocks) == 4
+    assert corenet.theta.weight.shape == corenet.phi.weight.shape == (256, 256)
+    assert elements(corenet3d("tiny")) < elements(corenet) / 10
+    assert [b.conv_0.in_features for b in npt().decoder.blocks] == [1027, 513, 256]
+    assert [b.conv_0.in_features for b in npt(preset="tiny").decoder.blocks] == [256, 128, 64]
+    for build in (xdualnet, corenet3d, lambda size: npt(preset=size)):
+        with pytest.raises(ValueError, match=r"preset must be one of \['paper', 'tiny'\], got 'huge'"):
+            build("huge")
+    with pytest.raises(ValueError, match='variant must be "maxpool" or "original"'):
+        npt("paper")
 
 
 @pytest.mark.parametrize("spectral", [True, False])
@@ -331,7 +623,16 @@ def test_generator_errors():
 SMALL = GeneratorConfig(**SIZES, descriptors="wks", num_signatures=2, eps=0.1, n_iters=3, spectral=False)
 
 
-@pytest.mark.parametrize("config", [GeneratorConfig(), SMALL, replace(SMALL, residual=True, normalize_plan=False)])
+@pytest.mark.parametrize(
+    "config",
+    [
+        GeneratorConfig(),
+        SMALL,
+        replace(SMALL, residual=True, normalize_plan=False),
+        replace(SMALL, extractor="pointwise", extractor_blocks=1, released=True),
+        GeneratorConfig(architecture="npt_original", extractor_widths=(4, 5)),
+    ],
+)
 def test_configuration_survives_json(config):
     assert GeneratorConfig.from_json(json.dumps(asdict(config))) == config
 
@@ -350,7 +651,7 @@ def test_configuration_reaches_the_generator():
     [
         ("{", "the model configuration is not JSON"),
         ("", "the model configuration is not JSON"),
-        ('{"kk": 3, "k": 3}', r"unknown fields \['kk'\] .* known: \['extractor_widths', 'k'"),
+        ('{"kk": 3, "k": 3}', r"unknown fields \['kk'\] .* known: \['architecture', 'extractor', 'extractor_w"),
         ("3", "model configuration"),
         ("[]", "model configuration"),
         ("null", "model configuration"),
@@ -361,9 +662,23 @@ def test_configuration_errors(text, message):
         GeneratorConfig.from_json(text)
 
 
-def test_unknown_descriptors():
+def test_configuration_names_the_architecture():
+    corenet = replace(SMALL, extractor="pointwise", extractor_blocks=1, released=True).build()
+    assert isinstance(corenet.extractor, PointwiseExtractor) and len(corenet.extractor.blocks) == 1
+    assert isinstance(corenet.transfer, OrderedPoseTransferStack) and corenet.extractor.descriptors == 3
+    for variant in ("maxpool", "original"):
+        net = GeneratorConfig(architecture=f"npt_{variant}", extractor_widths=(4, 5)).build()
+        assert isinstance(net, NPT) and net.variant == variant
+        assert [m.out_features for m in net.encoder.linears] == [4, 5]
+
+
+def test_configuration_build_errors():
     with pytest.raises(ValueError, match='must be "none" or "wks", got \'hks\''):
         GeneratorConfig(descriptors="hks").build()
+    with pytest.raises(ValueError, match=r'architecture must be "matching", "npt_maxpool" or .*, got \'unet\''):
+        GeneratorConfig(architecture="unet").build()
+    with pytest.raises(ValueError, match='NPT takes no descriptors: set descriptors="none"'):
+        replace(SMALL, architecture="npt_maxpool").build()
 
 
 @pytest.fixture
@@ -385,6 +700,16 @@ def test_load_generator_returns_the_saved_one_in_evaluation_mode(run):
     meshes = [rand(1, 9, 3, dtype=torch.float32), rand(1, 8, 3, seed=1, dtype=torch.float32)]
     extra = {f"{n}_descriptors": rand(1, v, 3).float() for n, v in (("identity", 9), ("pose", 8))}
     assert torch.equal(loaded(*meshes, **extra).vertices, net.eval()(*meshes, **extra).vertices)
+
+
+def test_load_generator_of_npt(tmp_path):
+    config = GeneratorConfig(architecture="npt_maxpool", extractor_widths=(4, 5))
+    net = config.build()
+    save_file(net.state_dict(), tmp_path / "model.safetensors")
+    (tmp_path / "model.json").write_text(json.dumps(asdict(config)))
+    loaded, read = load_generator(tmp_path)
+    meshes = [rand(1, 9, 3, dtype=torch.float32), rand(1, 8, 3, seed=1, dtype=torch.float32)]
+    assert read == config and torch.equal(loaded(*meshes).vertices, net(*meshes).vertices)
 
 
 def test_load_generator_without_descriptors(tmp_path):

@@ -165,7 +165,7 @@ class RiggedModel(nn.Module):
         if len(rotations) != len(verts):
             raise ValueError(f"identity and pose batches differ: {len(verts)} and {len(rotations)}")
         if self.pose_correctives is not None:
-            bend = (rotations[:, 1:] - torch.eye(3).to(rotations)).flatten(1)
+            bend = (rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten(1)
             verts = verts + torch.einsum("bp,pvc->bvc", bend, self.pose_correctives)
         globals_, positions = self._kinematics(rotations, joints)
         shift = positions - (globals_ @ joints[..., None])[..., 0]

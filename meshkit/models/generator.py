@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -11,68 +11,15 @@ from torch.nn.utils.parametrize import is_parametrized
 
 from meshkit.batching import masked_mean
 from meshkit.deform import rigid_moving_least_squares
-from meshkit.nn import ConditionalResBlock, SetConvExtractor
+from meshkit.models._released_matching import STABILIZER, DensePlan, stabilized_matching
+from meshkit.models.ordered import OrderedPoseTransferStack
+from meshkit.models.output import GeneratorOutput
+from meshkit.models.pointwise import PointwiseExtractor
+from meshkit.models.stack import PoseTransferStack
+from meshkit.nn import SetConvExtractor
 from meshkit.ot import TransportPlan, sinkhorn
 
-__all__ = ["GeneratorOutput", "PoseTransferGenerator", "PoseTransferStack"]
-
-
-class GeneratorOutput(NamedTuple):
-    """What a generator returns.
-
-    Args:
-        vertices: ``(B, N, 3)`` generated mesh: identity of one input, pose of the other, vertex order of the identity.
-        warped: ``(B, N, 3)`` the pose mesh's vertices redistributed to the identity's order.
-        plan: matching between identity rows and pose columns.
-    """
-
-    vertices: Tensor
-    warped: Tensor
-    plan: TransportPlan
-
-
-class PoseTransferStack(nn.Module):
-    r"""Conditional residual blocks that turn the warped mesh into the output.
-
-    ``3 -> w_0 -> block -> w_1 -> block -> ... -> 3``, then :math:`2 \tanh`: coordinates stay within two units of the
-    centre, so meshes must be centred and scaled to metres (or any unit that keeps them in reach).
-
-    Args:
-        cond_features: channels of the condition (the identity's features).
-        widths: channels of the residual blocks; the paper has 1024, 512, 256.
-        spectral: spectral normalisation in the blocks.
-        residual: add the warped mesh to the output: the stack then learns a displacement.
-
-    Shape:
-        ``warped (B, N, 3)``, ``features (B, N, D)``, ``mask (B, N)``; the result is ``(B, N, 3)``.
-
-    Reference:
-        X-DualNet, appendix, table of the network architecture.
-
-    Deviations:
-        The paper's first convolution is 3 x 3 along the vertex order, which makes the result depend on an order that
-        is random. Here every map is per vertex, so the stack is permutation-equivariant.
-    """
-
-    def __init__(
-        self, cond_features: int, widths: Sequence[int], *, spectral: bool = True, residual: bool = False
-    ) -> None:
-        super().__init__()
-        self.residual = residual
-        self.lift = nn.Linear(3, widths[0])
-        self.mix = nn.Linear(widths[0], widths[0])
-        self.blocks = nn.ModuleList(ConditionalResBlock(w, cond_features, spectral=spectral) for w in widths)
-        self.narrow = nn.ModuleList(nn.Linear(i, o) for i, o in zip(widths, [*widths[1:], 3], strict=True))
-
-    def forward(self, warped: Tensor, features: Tensor, *, mask: Tensor | None = None) -> Tensor:
-        """Generate vertices from the warped mesh under the identity's features."""
-        # Nothing lies between the first two maps, so they are evaluated as one 3 -> w_0 map.
-        weight = self.mix.weight @ self.lift.weight
-        x = nn.functional.linear(warped, weight, self.mix(self.lift.bias))
-        for block, narrow in zip(self.blocks, self.narrow, strict=True):
-            x = block(x, features, mask=mask, then=narrow)
-        x = 2 * torch.tanh(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x)
-        return x + warped if self.residual else x
+__all__ = ["GeneratorOutput", "PoseTransferGenerator"]
 
 
 class PoseTransferGenerator(nn.Module):
@@ -81,11 +28,16 @@ class PoseTransferGenerator(nn.Module):
     .. math:: T = \mathrm{Sinkhorn}(f(A), f(B)), \qquad W_i = \frac{\sum_j T_{ij} B_j}{\sum_j T_{ij}}, \qquad
               G(A, B) = S(W, f(A))
 
-    for identity mesh A and pose mesh B, which may differ in vertex count and order.
+    for identity mesh A and pose mesh B, which may differ in vertex count and order. With the pointwise extractor of
+    3D-CoreNet two further linear maps bring the features to the matching,
+    :math:`T = \mathrm{Sinkhorn}(\theta f(A), \varphi f(B))`.
 
     Args:
+        extractor: ``"setconv"`` (X-DualNet: :class:`~meshkit.nn.SetConvExtractor`) or ``"pointwise"`` (3D-CoreNet:
+            :class:`~meshkit.models.PointwiseExtractor`, with theta and phi).
         extractor_widths: channels of the feature extractor.
-        k: neighbours in the extractor.
+        extractor_blocks: residual blocks of the pointwise extractor.
+        k: neighbours in the set convolutions.
         descriptors: descriptor channels per vertex beside the coordinates (0: coordinates alone, as in the paper).
         widths: channels of the residual blocks.
         condition: what the residual blocks know of the identity. ``"features"``: the extractor's features, as in the
@@ -106,6 +58,9 @@ class PoseTransferGenerator(nn.Module):
             of the pose mesh's body.
         normalize_plan: warp with the row-normalised plan (released code). ``False`` warps with the raw plan as the
             paper prints it, whose rows sum to 1/N, so that the warped mesh is N times too small.
+        released: the released code to the letter: its first convolution
+            (:class:`~meshkit.models.OrderedPoseTransferStack`), and the 1e-8 that it adds to the denominators of the
+            matching. For checkpoints of that code; see :func:`~meshkit.models.load_released_checkpoint`.
 
     Shape:
         ``identity (B, N, 3)``, ``pose (B, M, 3)``, masks ``(B, N)`` and ``(B, M)``, descriptors ``(B, N, D)`` and
@@ -126,7 +81,9 @@ class PoseTransferGenerator(nn.Module):
     def __init__(
         self,
         *,
+        extractor: str = "setconv",
         extractor_widths: Sequence[int] = (32, 64, 128),
+        extractor_blocks: int = 4,
         k: int = 32,
         descriptors: int = 0,
         widths: Sequence[int] = (1024, 512, 256),
@@ -138,21 +95,34 @@ class PoseTransferGenerator(nn.Module):
         rigid_radius: float | None = None,
         match_size: bool = False,
         normalize_plan: bool = True,
+        released: bool = False,
     ) -> None:
         super().__init__()
         if not eps > 0 or n_iters < 1 or k < 1:
             raise ValueError(f"eps, n_iters and k must be positive, got {eps}, {n_iters} and {k}")
         if not widths or not extractor_widths or min(*widths, *extractor_widths) < 1:
             raise ValueError(f"widths must be positive, got {extractor_widths} and {widths}")
+        if extractor not in ("setconv", "pointwise"):
+            raise ValueError(f'extractor must be "setconv" or "pointwise", got {extractor!r}')
         if condition not in ("features", "descriptors"):
             raise ValueError(f'condition must be "features" or "descriptors", got {condition!r}')
         if (condition == "descriptors" or match_size) and descriptors == 0:
             raise ValueError('condition="descriptors" and match_size need descriptors: give their number of channels')
         self.eps, self.n_iters, self.normalize_plan = eps, n_iters, normalize_plan
         self.condition, self.rigid_radius, self.match_size = condition, rigid_radius, match_size
-        self.extractor = SetConvExtractor(extractor_widths, k=k, descriptors=descriptors)
-        cond_features = extractor_widths[-1] if condition == "features" else descriptors
-        self.transfer = PoseTransferStack(cond_features, widths, spectral=spectral, residual=residual)
+        features = extractor_widths[-1]
+        self.extractor: SetConvExtractor | PointwiseExtractor
+        if extractor == "setconv":
+            self.extractor = SetConvExtractor(extractor_widths, k=k, descriptors=descriptors)
+            self.theta: nn.Module = nn.Identity()
+            self.phi: nn.Module = nn.Identity()
+        else:
+            self.extractor = PointwiseExtractor(extractor_widths, blocks=extractor_blocks, descriptors=descriptors)
+            self.theta, self.phi = nn.Linear(features, features), nn.Linear(features, features)
+        stack = OrderedPoseTransferStack if released else PoseTransferStack
+        self.released = released
+        cond_features = features if condition == "features" else descriptors
+        self.transfer = stack(cond_features, widths, spectral=spectral, residual=residual)
         self.register_buffer("descriptor_mean", torch.zeros(descriptors))
         self.register_buffer("descriptor_std", torch.ones(descriptors))
         self.reset_parameters()
@@ -193,6 +163,19 @@ class PoseTransferGenerator(nn.Module):
         # Signatures have long tails where a mesh has spikes; four deviations hold all that is signal.
         return ((descriptors - self.descriptor_mean) / self.descriptor_std).clamp(-4, 4)
 
+    def _match(
+        self, identity: Tensor, pose: Tensor, identity_mask: Tensor | None, pose_mask: Tensor | None
+    ) -> TransportPlan | DensePlan:
+        """The plan between two meshes' features."""
+        pair = (self.theta(identity), self.phi(pose))
+        options: dict[str, Any] = {"eps": self.eps, "n_iters": self.n_iters}
+        options |= {"mask_x": identity_mask, "mask_y": pose_mask}
+        if not self.released:
+            return sinkhorn(*pair, **options)
+        # X-DualNet's code adds the constant once more where it normalises the rows; 3D-CoreNet's does not.
+        floor = STABILIZER if isinstance(self.extractor, SetConvExtractor) else 0.0
+        return stabilized_matching(*pair, **options, floor=floor)
+
     def forward(
         self,
         identity: Tensor,
@@ -215,17 +198,10 @@ class PoseTransferGenerator(nn.Module):
             identity_features = self.encode(identity, mask=identity_mask, descriptors=identity_descriptors)
         if pose_features is None:
             pose_features = self.encode(pose, mask=pose_mask, descriptors=pose_descriptors)
-        plan = sinkhorn(
-            identity_features,
-            pose_features,
-            eps=self.eps,
-            n_iters=self.n_iters,
-            mask_x=identity_mask,
-            mask_y=pose_mask,
-        )
+        plan = self._match(identity_features, pose_features, identity_mask, pose_mask)
         if pose_mask is not None:
             pose = pose.masked_fill(~pose_mask[..., None], 0.0)
-        values = pose.to(plan.kernel.dtype)
+        values = pose.to(plan.dtype)
         if self.match_size:
             if identity_descriptors is None or pose_descriptors is None:
                 raise ValueError("match_size needs identity_descriptors and pose_descriptors, also beside features")

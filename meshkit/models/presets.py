@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from meshkit.models.generator import PoseTransferGenerator
+from meshkit.models.npt import NPT
 
-__all__ = ["GeneratorConfig", "load_generator", "xdualnet"]
+__all__ = ["GeneratorConfig", "corenet3d", "load_generator", "npt", "xdualnet"]
 
 
 @dataclass(frozen=True)
 class GeneratorConfig:
     """Arguments of :class:`~meshkit.models.PoseTransferGenerator`, plus which descriptors feed it.
 
-    The defaults are the paper's sizes.
+    The defaults are the paper's sizes. With ``architecture="npt_maxpool"`` or ``"npt_original"`` it describes an
+    :class:`~meshkit.models.NPT`, which has no matching: of the other fields only ``extractor_widths`` counts then, as
+    the encoder's channels.
     """
 
+    architecture: str = "matching"
+    """matching: X-DualNet and 3D-CoreNet; npt_maxpool, npt_original: NPT."""
+    extractor: str = "setconv"
+    """setconv: X-DualNet; pointwise: 3D-CoreNet."""
     extractor_widths: tuple[int, ...] = (32, 64, 128)
-    """Channels of the feature extractor. Paper: 32, 64, 128."""
+    """Channels of the feature extractor. Paper: 32, 64, 128. 3D-CoreNet: 64, 128, 256. NPT: 64, 128, 1024."""
+    extractor_blocks: int = 4
+    """Residual blocks of the pointwise extractor. 3D-CoreNet: 4."""
     k: int = 32
     """Neighbours in the extractor. Released code: 32."""
     widths: tuple[int, ...] = (1024, 512, 256)
@@ -46,12 +55,26 @@ class GeneratorConfig:
     """none: coordinates alone, the paper; wks: wave-kernel signatures and the size of the mesh besides."""
     num_signatures: int = 16
     """How many signatures, when there are any."""
+    released: bool = False
+    """The released code to the letter, for its checkpoints: first convolution along the vertex order."""
 
-    def build(self) -> PoseTransferGenerator:
+    def build(self) -> PoseTransferGenerator | NPT:
         """The generator of this configuration, freshly initialised."""
+        if self.architecture not in ("matching", "npt_maxpool", "npt_original"):
+            raise ValueError(
+                f'architecture must be "matching", "npt_maxpool" or "npt_original", got {self.architecture!r}'
+            )
         if self.descriptors not in ("none", "wks"):
             raise ValueError(f'descriptors must be "none" or "wks", got {self.descriptors!r}')
+        if self.architecture != "matching":
+            if self.descriptors != "none":
+                raise ValueError('NPT takes no descriptors: set descriptors="none"')
+            return NPT(self.architecture.removeprefix("npt_"), encoder_widths=self.extractor_widths)
+        return self._build_matching()
+
+    def _build_matching(self) -> PoseTransferGenerator:
         arguments = asdict(self)
+        del arguments["architecture"]
         if self.condition == "auto":
             arguments["condition"] = "features" if self.descriptors == "none" else "descriptors"
         signatures = arguments.pop("num_signatures")
@@ -89,26 +112,67 @@ PRESETS = {
         descriptors="wks",
     ),
 }
+_CORENET3D = {
+    "paper": GeneratorConfig(extractor="pointwise", extractor_widths=(64, 128, 256)),
+    "tiny": replace(PRESETS["tiny"], extractor="pointwise", extractor_widths=(16, 32, 64), extractor_blocks=2),
+}
+_NPT = {"paper": (64, 128, 1024), "tiny": (32, 64, 253)}
 
 
-def xdualnet(preset: str = "paper") -> PoseTransferGenerator:
-    """X-DualNet's generator (3D-CoreNet's as well: they differ in the training objective).
+def xdualnet(preset: str = "paper", *, released: bool = False) -> PoseTransferGenerator:
+    """X-DualNet's generator.
 
     Args:
         preset: ``"paper"`` (extractor 32/64/128 over 32 neighbours, blocks 1024/512/256) or ``"tiny"`` (16/32/32 over
             8 neighbours, blocks 256/128/64 that displace the warped mesh, intrinsic descriptors at the extractor's
             input and as the blocks' condition), which trains on a laptop's CPU.
+        released: the released code's first convolution, of kernel 3 along the vertex order, and its matching. The
+            model is then not permutation-equivariant.
 
     Example:
         >>> sum(p.numel() for p in xdualnet("tiny").parameters()) < 2_000_000
         True
     """
-    if preset not in PRESETS:
-        raise ValueError(f"preset must be one of {sorted(PRESETS)}, got {preset!r}")
-    return PRESETS[preset].build()
+    return replace(_pick(PRESETS, preset), released=released)._build_matching()
 
 
-def load_generator(folder: str | Path) -> tuple[PoseTransferGenerator, GeneratorConfig]:
+def corenet3d(preset: str = "paper", *, released: bool = False) -> PoseTransferGenerator:
+    """3D-CoreNet's generator: X-DualNet's, but with a pointwise extractor and two maps before the matching.
+
+    Args:
+        preset: ``"paper"`` (extractor 64/128/256 with 4 residual blocks, blocks 1024/512/256) or ``"tiny"`` (16/32/64
+            with 2, the rest as ``xdualnet("tiny")``).
+        released: as in :func:`xdualnet`.
+
+    Example:
+        >>> sum(p.numel() for p in corenet3d("tiny").parameters()) < 2_000_000
+        True
+    """
+    return replace(_pick(_CORENET3D, preset), released=released)._build_matching()
+
+
+def npt(variant: str = "maxpool", *, preset: str = "paper") -> NPT:
+    """Neural Pose Transfer, the baseline without correspondence.
+
+    Args:
+        variant: ``"maxpool"``, or ``"original"`` for meshes of equal vertex counts.
+        preset: ``"paper"`` (encoder 64/128/1024, blocks 1027/513/256, which is also the released layout) or ``"tiny"``
+            (32/64/253, blocks 256/128/64).
+
+    Example:
+        >>> sum(p.numel() for p in npt(preset="tiny").parameters()) < 500_000
+        True
+    """
+    return NPT(variant, encoder_widths=_pick(_NPT, preset))
+
+
+def _pick(presets: dict[str, Any], name: str) -> Any:
+    if name not in presets:
+        raise ValueError(f"preset must be one of {sorted(presets)}, got {name!r}")
+    return presets[name]
+
+
+def load_generator(folder: str | Path) -> tuple[PoseTransferGenerator | NPT, GeneratorConfig]:
     """Read ``model.safetensors`` and ``model.json`` from a run's folder.
 
     Raises:
@@ -125,6 +189,6 @@ def load_generator(folder: str | Path) -> tuple[PoseTransferGenerator, Generator
         model = config.build()
         model.load_state_dict(load_file(folder / "model.safetensors"))
     except Exception as error:  # torch, safetensors and load_state_dict each raise their own kinds
-        reason = str(error).splitlines()[0]
+        reason = (str(error).splitlines() or [repr(error)])[0]
         raise ValueError(f"the weights in {folder} cannot be read into this model: {reason}") from error
     return model.eval(), config
