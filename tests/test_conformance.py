@@ -183,7 +183,6 @@ ENTRIES = {
         rigged,
         prepare=lambda inputs: {"identity": rand(2, 2).to(DTYPE), "pose": rand(2, 3, 3, seed=1).to(DTYPE)},
         out=None,
-        default_device=False,
     ),
 }
 ENTRIES |= {

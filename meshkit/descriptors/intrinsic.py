@@ -17,7 +17,7 @@ def intrinsic_descriptors(
     *,
     num_signatures: int = 16,
     num_eigenpairs: int = 64,
-    width: float = 7.0,
+    width: float = 1.0,
     mask: Tensor | None = None,
     method: str = "exact",
     robust: bool = False,
