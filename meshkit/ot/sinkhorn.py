@@ -1,62 +1,95 @@
-"""Entropic optimal transport between feature sets, with the exact gradient of the iterations."""
+"""Entropic optimal transport between feature sets or under a given cost, with the exact gradient of the iterations."""
 
 from __future__ import annotations
-
-import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from meshkit.ot.costs import logit_features
+from meshkit.ot.iterations import iterate_kernel, iterate_log
+from meshkit.ot.kernel import GibbsKernel, uncompiled
+from meshkit.ot.marginals import Sides, check_totals, pick, weights
+from meshkit.ot.options import Cost, Domain, Eps, Grad, Options, Reach, Store, check_choice, read_options
 from meshkit.ot.plan import TransportPlan
+from meshkit.ot.sample import SamplePlan
+from meshkit.ot.tiles import LOG2_E, MatrixTiles, feature_tiles
 
-__all__ = ["sinkhorn"]
+__all__ = ["eps_schedule", "sinkhorn", "sinkhorn_from_cost", "sinkhorn_warp"]
 
 
+@uncompiled
 def sinkhorn(
     fx: Tensor,
     fy: Tensor,
     *,
-    eps: float = 0.03,
+    cost: Cost = "cosine",
+    eps: Eps = 0.03,
     n_iters: int = 5,
+    tol: float | None = None,
+    a: Tensor | None = None,
+    b: Tensor | None = None,
     mask_x: Tensor | None = None,
     mask_y: Tensor | None = None,
-    domain: str = "auto",
+    reach: Reach = None,
+    grad: Grad = "unroll",
+    domain: Domain = "auto",
+    store: Store = "auto",
+    check_finite: bool = False,
 ) -> TransportPlan:
-    r"""Transport plan between two sets of features under the cosine cost.
+    r"""Transport plan between two sets of features.
 
-    With :math:`C_{ij} = \cos(x_i, y_j)`, cost :math:`Z = 1 - C` and :math:`K = \exp(-Z/\varepsilon)`, starting from
-    :math:`a_0 = \mu`, the iterations are
+    With the cost :math:`C_{ij}` and :math:`K = \exp(-C/\varepsilon)`, starting from :math:`a_0 = \mu`, the iterations
 
     .. math:: b_t = \nu / (K^\top a_{t-1}), \qquad a_t = \mu / (K b_t), \qquad T = \mathrm{diag}(a)\,K\,\mathrm{diag}(b)
 
-    with uniform marginals :math:`\mu_i = 1/N`, :math:`\nu_j = 1/M` over the real vertices. Row sums are exact after
-    any number of iterations, column sums converge. The cosine sees directions only: features with a common offset, such
-    as raw signatures, all look alike; standardise them first.
+    approach the plan that minimises :math:`\langle T, C \rangle + \varepsilon \sum T (\log T - 1)` with row sums
+    :math:`\mu` and column sums :math:`\nu`. Row sums are exact after any number of iterations, column sums converge.
 
-    The gradient is that of the iterations as run, not of their limit: every half step has a rank-one Jacobian on the
-    kernel, so only the scalings are kept and the gradient is one low-rank product.
+    Neither cost nor plan is stored, unless ``store`` asks for it: K is computed from the features in blocks of rows,
+    and the gradient of all iterations is :math:`K \circ A B^\top` with 2T - 1 columns in A and B.
 
     Args:
         fx: ``(B, N, D)`` features of the rows (identity mesh).
         fy: ``(B, M, D)`` features of the columns (pose mesh).
-        eps: entropic regularisation, in units of the cost (which lies in [0, 2]).
-        n_iters: number of iterations.
-        mask_x: ``(B, N)`` bool, True = real vertex.
+        cost: ``"cosine"``, :math:`1 - \cos(x_i, y_j)`; ``"sqeuclidean"``, :math:`\lVert x_i - y_j \rVert^2`;
+            ``"dot"``, :math:`-\langle x_i, y_j \rangle`. The cosine sees directions only: features with a common
+            offset, such as raw signatures, all look alike; standardise them first.
+        eps: entropic regularisation, in units of the cost (the cosine cost lies in [0, 2]). A scalar tensor receives
+            a gradient. A sequence is annealed: one value per iteration, the last one kept, as from
+            :func:`eps_schedule`.
+        n_iters: number of iterations, the largest number if ``tol`` is given.
+        tol: stop a sample once its column sums are this close to :math:`\nu`, as a sum of absolute differences; with
+            ``reach``, once :math:`b` changes by so little, weighted by :math:`\nu`.
+        a: ``(B, N)`` or ``(N,)`` row weights :math:`\mu`, uniform with sum 1 by default. Rows of weight 0 are left out.
+        b: ``(B, M)`` or ``(M,)`` column weights :math:`\nu`.
+        mask_x: ``(B, N)`` bool, True = real vertex. Masked rows are left out, whatever they hold.
         mask_y: ``(B, M)`` bool.
+        reach: weight :math:`\rho` of the marginal penalty of unbalanced transport, in units of the cost: scalings are
+            raised to the power :math:`\rho / (\rho + \varepsilon)`. A pair gives rows and columns their own, ``None``
+            keeps a side exact.
+        grad: ``"unroll"``, the exact gradient of the iterations as run; ``"implicit"``, that of their limit, for plans
+            run to convergence (5 iterations are not); ``"last_step"``, through the last iteration only; ``"none"``, the
+            plan is a constant.
         domain: ``"kernel"`` iterates on :math:`K` (fast), ``"log"`` on its logarithm (safe at any ``eps``), ``"auto"``
-            takes the kernel where the dtype's range allows: ``eps >= 2 / (log(max) - log(N M))``, .0282 for
-            6890 x 6890 in float32.
+            takes the kernel where the range of the dtype allows: for uniform weights and the cosine cost
+            ``eps >= 2 / (log(max) - log(N M))``, .0282 for 6890 x 6890 in float32.
+        store: ``"keep"`` holds K for all later sweeps and the backward pass, N x M numbers per sample; ``"stream"``
+            computes it again, in :math:`O((N + M) D)` memory; ``"auto"`` keeps up to 1 GiB.
+        check_finite: raise an error if a real vertex has a feature that is not finite.
 
     Returns:
         The :class:`~meshkit.ot.TransportPlan`, in float32 or better whatever the autocast state. A zero feature has
-        cosine 0 with everything, and gradient 0. A sample with every vertex masked has a plan without mass.
+        cosine 0 with everything, and gradient 0. A sample with every vertex masked has a plan without mass. A feature
+        that is not finite spoils the plan of its own sample alone.
 
     Raises:
-        ValueError: shapes do not fit, a mesh is empty, ``eps`` or ``n_iters`` is not positive, ``domain`` is unknown.
+        ValueError: shapes do not fit, a mesh is empty, an option is unknown or out of range, weights are negative or
+            of different total.
+        RuntimeError: a second derivative is asked for.
 
     Reference:
-        X-DualNet, "Optimal transport problem" and Algorithm 1 (eps 0.03, 5 iterations).
+        X-DualNet, "Optimal transport problem" and Algorithm 1 (cosine, eps 0.03, 5 iterations). Unbalanced form: FLOT
+        (Puy et al. 2020), after Chizat et al. 2018.
 
     Deviations:
         The released code adds 1e-8 to the denominators, which moves its warps by up to a few per cent; here nothing
@@ -67,115 +100,191 @@ def sinkhorn(
         >>> sinkhorn(features, features[:, [2, 0, 1]]).argmax().tolist()
         [[1, 2, 0]]
     """
-    _check(fx, fy, eps, n_iters, mask_x, mask_y, domain)
+    check_features(fx, fy)
+    check_choice("cost", cost, Cost)
+    options = read_options(eps, n_iters, tol, reach, grad, domain, store)
+    batch, rows, columns = len(fx), fx.shape[1], fy.shape[1]
+    dtype = torch.promote_types(torch.promote_types(fx.dtype, fy.dtype), torch.float32)
     with torch.autocast(fx.device.type, enabled=False):
-        dtype = torch.promote_types(torch.promote_types(fx.dtype, fy.dtype), torch.float32)
-        x, mu = _unit(fx.to(dtype), mask_x)
-        y, nu = _unit(fy.to(dtype), mask_y)
-        if domain == "auto":
-            limit = math.log(torch.finfo(dtype).max) - math.log(x.shape[1] * y.shape[1])
-            domain = "kernel" if eps * limit >= 2 else "log"
-        alive_x, alive_y = _alive(mu), _alive(nu)
-        mu, nu = mu + (~alive_x).to(dtype) / mu.shape[1], nu + (~alive_y).to(dtype) / nu.shape[1]
-        if domain == "log":
-            kernel, a, b = _log_sinkhorn(x, y, mu, nu, eps, n_iters)
-        else:
-            # The constant shift -1/eps of the cost cancels between the scalings; keeping it keeps K <= 1.
-            rate = math.log2(math.e) / eps  # exp2 is several times faster than exp on CPUs
-            kernel = torch.exp2((rate * x) @ y.mT - rate)
-            a, b = _Scalings.apply(kernel, mu, nu, n_iters)
-        # A sample without vertices was solved with weights that stand in; it carries no mass.
-        alive = alive_x & alive_y
-        return TransportPlan(kernel, torch.where(alive, a, 0.0), torch.where(alive, b, 0.0))
+        mu, nu = weights(a, mask_x, fx, dtype, "x"), weights(b, mask_y, fy, dtype, "y")
+        if not options.unbalanced and (a is not None or b is not None):
+            check_totals(mu, nu)
+        keep = options.keep(batch * rows * columns * dtype.itemsize)
+        samples = []
+        for s in range(batch):
+            sides = pick(mu, nu, s, rows, columns, fx)
+            x, y = sides.rows_of(fx[s].to(dtype)), sides.columns_of(fy[s].to(dtype))
+            if check_finite and not bool(x.isfinite().all() & y.isfinite().all()):
+                raise ValueError(f"sample {s} has features that are not finite; mask those vertices or mend them")
+            if grad == "none":
+                x, y, sides = x.detach(), y.detach(), sides.detached()
+            x, y, spread, shift = logit_features(x, y, cost, options.eps, constant=options.unbalanced)
+            chosen = options.domain_for(spread, sides)
+            tiles = feature_tiles(x, y, "none" if not keep else "kernel" if chosen == "kernel" else "logits")
+            chosen = "log" if tiles.log_only and len(x) else chosen
+            samples.append(solve(GibbsKernel(tiles, x, y), sides, options, chosen, shift))
+        return TransportPlan(samples, (batch, rows, columns))
 
 
-def _alive(weights: Tensor) -> Tensor:
-    """Samples with any weight at all, ``(B, 1)``."""
-    return (weights > 0).any(1, keepdim=True)
+def sinkhorn_from_cost(
+    cost: Tensor,
+    *,
+    eps: Eps = 0.03,
+    n_iters: int = 5,
+    tol: float | None = None,
+    a: Tensor | None = None,
+    b: Tensor | None = None,
+    mask_x: Tensor | None = None,
+    mask_y: Tensor | None = None,
+    reach: Reach = None,
+    grad: Grad = "unroll",
+    domain: Domain = "auto",
+    store: Store = "auto",
+) -> TransportPlan:
+    r"""Transport plan under a given cost matrix, as :func:`sinkhorn` otherwise.
+
+    Args:
+        cost: ``(B, N, M)``, finite in real rows and columns. Its gradient is a dense matrix.
+        eps: entropic regularisation, in units of the cost.
+        n_iters: number of iterations.
+        tol: see :func:`sinkhorn`, as all further arguments.
+        a: row weights.
+        b: column weights.
+        mask_x: ``(B, N)`` real rows.
+        mask_y: ``(B, M)`` real columns.
+        reach: marginal penalty.
+        grad: gradient mode.
+        domain: ``"auto"`` looks at the range of the cost.
+        store: ``"keep"`` holds the exponential of the cost beside the cost.
+
+    Returns:
+        The :class:`~meshkit.ot.TransportPlan`.
+
+    Raises:
+        ValueError: as :func:`sinkhorn`.
+
+    Example:
+        >>> plan = sinkhorn_from_cost(torch.tensor([[[0.0, 1.0], [1.0, 0.0]]]), eps=0.1)
+        >>> (2 * plan.dense()[0]).round(decimals=3)
+        tensor([[1., 0.],
+                [0., 1.]])
+    """
+    return solve_cost(
+        cost, read_options(eps, n_iters, tol, reach, grad, domain, store), a=a, b=b, mask_x=mask_x, mask_y=mask_y
+    )
 
 
-def _unit(features: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Features of unit norm (zero stays zero, with zero gradient; padding is zeroed) and uniform weights."""
-    weights = features.new_ones(features.shape[:2]) if mask is None else mask.to(features.dtype)
-    if mask is not None:
-        features = features.masked_fill(~mask[..., None], 0.0)
-    squared = features.square().sum(2, keepdim=True)
-    alive = squared > 0
-    features = features * torch.where(alive, torch.where(alive, squared, 1.0).rsqrt(), 0.0)
-    return features, weights / weights.sum(1, keepdim=True).clamp_min(1.0)
+@uncompiled
+def solve_cost(
+    cost: Tensor,
+    options: Options,
+    *,
+    a: Tensor | None = None,
+    b: Tensor | None = None,
+    mask_x: Tensor | None = None,
+    mask_y: Tensor | None = None,
+    start: Tensor | None = None,
+) -> TransportPlan:
+    """:func:`sinkhorn_from_cost` with options read already; ``start (B, N)`` is the log of the first row scaling."""
+    if cost.dim() != 3 or cost.shape[1] == 0 or cost.shape[2] == 0:
+        raise ValueError(f"cost must be (B, N, M) with at least one row and column, got {tuple(cost.shape)}")
+    batch, rows, columns = cost.shape
+    dtype = torch.promote_types(cost.dtype, torch.float32)
+    with torch.autocast(cost.device.type, enabled=False):
+        mu, nu = weights(a, mask_x, cost, dtype, "x"), weights(b, mask_y, cost.mT, dtype, "y")
+        if not options.unbalanced and (a is not None or b is not None):
+            check_totals(mu, nu)
+        keep = options.keep(batch * rows * columns * dtype.itemsize)
+        samples = []
+        for s in range(batch):
+            sides = pick(mu, nu, s, rows, columns, cost)
+            matrix = sides.columns_of(sides.rows_of(cost[s].to(dtype)).mT).mT
+            if options.settings.grad == "none":
+                matrix, sides = matrix.detach(), sides.detached()
+            shift = float(matrix.detach().amin()) if matrix.numel() and not options.unbalanced else 0.0
+            logits = (shift - matrix) * (LOG2_E / options.eps)
+            spread = float(logits.detach().abs().amax()) / LOG2_E if logits.numel() else 0.0
+            chosen = "log" if start is not None else options.domain_for(spread, sides)
+            first = None if start is None else LOG2_E * sides.rows_of(start[s].to(dtype))
+            kernel = GibbsKernel(MatrixTiles(logits, "kernel" if keep and chosen == "kernel" else "none"), logits)
+            samples.append(solve(kernel, sides, options, chosen, shift, first))
+        return TransportPlan(samples, (batch, rows, columns))
 
 
-def _matvec(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Batched matrix-vector product; one gemv per sample is far faster than a batched product with one column."""
-    return torch.stack([torch.mv(m, v) for m, v in zip(matrix, vector, strict=True)])
+def sinkhorn_warp(fx: Tensor, fy: Tensor, values: Tensor, **options: object) -> Tensor:
+    r"""Carry ``values`` of the columns to the rows, :math:`\sum_j T_{ij} v_j / \sum_j T_{ij}`.
+
+    The last half step cancels in the quotient and is not computed: T iterations and the warp are T + 1 sweeps.
+
+    Args:
+        fx: ``(B, N, D)`` features of the rows.
+        fy: ``(B, M, D)`` features of the columns.
+        values: ``(B, M, C)``.
+        options: keyword arguments of :func:`sinkhorn`.
+
+    Returns:
+        ``(B, N, C)``, each row a convex combination of the values; 0 for masked rows.
+
+    Raises:
+        ValueError: as :func:`sinkhorn`, and if ``values`` do not fit.
+
+    Reference:
+        X-DualNet, "Optimal transport problem", the warp of the pose mesh.
+
+    Example:
+        >>> features = torch.eye(2)[None]
+        >>> sinkhorn_warp(features, features, torch.tensor([[[1.0], [2.0]]]))[0, :, 0]
+        tensor([1., 2.])
+    """
+    return sinkhorn(fx, fy, **options).barycentric(values)  # type: ignore[arg-type]
 
 
-class _Scalings(torch.autograd.Function):
-    """``(a_T, b_T)`` of the Sinkhorn iterations; the backward pass needs only the 2T scalings and K."""
+def eps_schedule(start: float, final: float, *, factor: float = 0.5) -> list[float]:
+    """Regularisations from ``start`` down to ``final`` in geometric steps, for :func:`sinkhorn`'s ``eps``.
 
-    @staticmethod
-    def forward(ctx: Any, kernel: Tensor, mu: Tensor, nu: Tensor, n_iters: int) -> tuple[Tensor, Tensor]:
-        a, scalings = mu, [mu]
-        for _ in range(n_iters):
-            b = nu / _matvec(kernel.mT, a)
-            a = mu / _matvec(kernel, b)
-            scalings += [b, a]
-        ctx.save_for_backward(kernel, mu, nu, *scalings)
-        return a, b
+    Raises:
+        ValueError: unless ``start >= final > 0`` are finite and ``0 < factor < 1``.
 
-    @staticmethod
-    def backward(ctx: Any, grad_a: Tensor, grad_b: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():
-            raise RuntimeError('sinkhorn has no second derivatives in the kernel domain: use domain="log"')
-        kernel, mu, nu, *scalings = ctx.saved_tensors
-        rows, columns = scalings[0::2], scalings[1::2]
-        left, right = [], []
-        for t in range(len(columns), 0, -1):
-            a, b = rows[t], columns[t - 1]
-            # a = mu / r with r = K b, so da/dr = -a^2 / mu; padded rows (mu = 0) have a = 0 and no gradient. The order
-            # of the factors keeps a^2, which may overflow, from being formed.
-            grad_r = -(grad_a * a) * (a / torch.where(mu > 0, mu, 1.0))
-            left.append(grad_r)
-            right.append(b)
-            grad_b = grad_b + _matvec(kernel.mT, grad_r)
-            grad_c = -(grad_b * b) * (b / torch.where(nu > 0, nu, 1.0))
-            left.append(rows[t - 1])
-            right.append(grad_c)
-            grad_a = _matvec(kernel, grad_c)
-            grad_b = torch.zeros_like(grad_b)
-        return torch.stack(left, 2) @ torch.stack(right, 1), None, None, None
+    Example:
+        >>> eps_schedule(1.0, 0.2)
+        [1.0, 0.5, 0.25, 0.2]
+    """
+    if not (float("inf") > start >= final > 0 and 0 < factor < 1):
+        raise ValueError(f"need finite start >= final > 0 and 0 < factor < 1, got {start}, {final} and {factor}")
+    values = []
+    while start > final:
+        values.append(start)
+        start *= factor
+    return [*values, final]
 
 
-def _log_sinkhorn(
-    x: Tensor, y: Tensor, mu: Tensor, nu: Tensor, eps: float, n_iters: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    logits = x @ y.mT / eps
-    log_mu, log_nu = mu.log()[..., None], nu.log()[:, None]
-    # A padded row has log weight -inf: it must neither receive -inf + inf nor send anything.
-    pad_x, pad_y = mu[..., None] == 0, nu[:, None] == 0
-    alpha = log_mu
-    for _ in range(n_iters):
-        beta = torch.where(pad_y, -torch.inf, log_nu - torch.logsumexp(logits + alpha, 1, keepdim=True))
-        alpha = torch.where(pad_x, -torch.inf, log_mu - torch.logsumexp(logits + beta, 2, keepdim=True))
-    # The logarithms hold the scalings already; ones and zeros mark real and padded vertices.
-    return torch.exp(logits + alpha + beta), (mu > 0).to(mu.dtype), (nu > 0).to(nu.dtype)
+def solve(
+    kernel: GibbsKernel, sides: Sides, options: Options, domain: str, shift: float, start: Tensor | None = None
+) -> SamplePlan:
+    """Iterate in the chosen domain."""
+    if domain == "kernel" or len(sides.mu) == 0:
+        solution = iterate_kernel(kernel, sides.mu, sides.nu, options.settings)
+    else:
+        solution = iterate_log(kernel, sides.mu, sides.nu, options.settings, start)
+    return SamplePlan(
+        kernel=kernel,
+        mu=sides.mu,
+        nu=sides.nu,
+        b=solution.b,
+        reference=solution.reference,
+        power_x=options.settings.power_x,
+        eps=options.eps,
+        shift=shift,
+        index_x=sides.index_x,
+        index_y=sides.index_y,
+        n_iters=solution.n_iters,
+    )
 
 
-def _check(
-    fx: Tensor, fy: Tensor, eps: float, n_iters: int, mask_x: Tensor | None, mask_y: Tensor | None, domain: str
-) -> None:
+def check_features(fx: Tensor, fy: Tensor) -> None:
+    """Shapes of two batches of features."""
     if fx.dim() != 3 or fy.dim() != 3 or fx.shape[0] != fy.shape[0] or fx.shape[2] != fy.shape[2]:
-        raise ValueError(f"features must be (B, N, D) and (B, M, D), got {tuple(fx.shape)} and {tuple(fy.shape)}")
-    if fx.shape[1] == 0 or fy.shape[1] == 0:
-        raise ValueError(f"a set is empty: got {fx.shape[1]} rows and {fy.shape[1]} columns")
-    for name, mask, features in (("mask_x", mask_x, fx), ("mask_y", mask_y, fy)):
-        if mask is not None and (mask.dtype != torch.bool or mask.shape != features.shape[:2]):
-            raise ValueError(
-                f"{name} must be bool of shape {tuple(features.shape[:2])}, got {mask.dtype} {tuple(mask.shape)}"
-            )
-    if not eps > 0:
-        raise ValueError(f"eps must be positive, got {eps}")
-    if n_iters < 1:
-        raise ValueError(f"n_iters must be at least 1, got {n_iters}")
-    if domain not in ("auto", "kernel", "log"):
-        raise ValueError(f'domain must be "auto", "kernel" or "log", got {domain!r}')
+        hint = "; add a batch dimension with [None]" if fx.dim() == fy.dim() == 2 else ""
+        raise ValueError(f"features must be (B, N, D) and (B, M, D), got {tuple(fx.shape)} and {tuple(fy.shape)}{hint}")
+    if 0 in fx.shape or 0 in fy.shape:
+        raise ValueError(f"a set is empty: got features {tuple(fx.shape)} and {tuple(fy.shape)}")

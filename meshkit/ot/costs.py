@@ -1,0 +1,51 @@
+"""Costs between features, written as inner products."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from meshkit.ot.tiles import LOG2_E
+
+
+def logit_features(
+    x: Tensor, y: Tensor, cost: str, eps: float | Tensor, *, constant: bool
+) -> tuple[Tensor, Tensor, float, float]:
+    """Features whose inner products are the base-2 logits, a bound on the logits' spread (nats), and the cost shift.
+
+    The cost is ``shift`` minus eps times the logit. A shift changes nothing in balanced transport; with ``constant`` it
+    is 0, for unbalanced transport.
+    """
+    rate, value = LOG2_E / eps, float(eps.detach() if isinstance(eps, Tensor) else eps)
+    if cost == "dot":
+        bound = 2 * float(norms(x).amax() * norms(y).amax()) if len(x) else 0.0
+        return x * rate, y.clone(), bound / value, 0.0  # of its own: the caller may change y in place later
+    if cost == "cosine":
+        x, y = unit(x), unit(y)
+        if not constant:
+            return x * rate, y, 2 / value, 1.0
+        x = torch.cat([x, -torch.ones_like(x[:, :1])], 1) * rate
+        return x, torch.cat([y, y.new_ones(len(y), 1)], 1), 2 / value, 0.0
+    # |x - y|² = |x|² + |y|² - 2 x·y as one inner product; centred, so that less cancels.
+    if len(x):
+        centre = torch.cat([x, y]).detach().mean(0)
+        x, y = x - centre, y - centre
+    spread = float((norms(x).amax() + norms(y).amax()).square()) / value if len(x) else 0.0
+    squared_x, squared_y = x.square().sum(1, keepdim=True), y.square().sum(1, keepdim=True)
+    x = torch.cat([2 * x, -squared_x, -torch.ones_like(squared_x)], 1) * rate
+    return x, torch.cat([y, torch.ones_like(squared_y), squared_y], 1), spread, 0.0
+
+
+def norms(x: Tensor) -> Tensor:
+    """Length of each row, a constant."""
+    return x.detach().square().sum(1).sqrt()
+
+
+def unit(x: Tensor) -> Tensor:
+    """Rows of unit norm; zero rows stay zero, with zero gradient."""
+    # Divided by its largest entry first, a row's norm neither over- nor underflows; the direction does not change.
+    largest = x.detach().abs().amax(1, keepdim=True)
+    alive = largest > 0
+    x = x / torch.where(alive, largest, 1.0)
+    squared = x.square().sum(1, keepdim=True)
+    return x * torch.where(alive, torch.where(alive, squared, 1.0).rsqrt(), 0.0)

@@ -1,0 +1,84 @@
+"""Marginals of a batch: which rows and columns of each sample take part, and with what weight."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from meshkit.batching import check_mask
+
+
+class Sides(NamedTuple):
+    """Rows and columns of one sample that have weight; indices are ``None`` if all have."""
+
+    mu: Tensor
+    nu: Tensor
+    index_x: Tensor | None
+    index_y: Tensor | None
+    log_smallest: float
+
+    def rows_of(self, values: Tensor) -> Tensor:
+        """The rows ``(n, ...)`` that take part, of all ``(N, ...)``."""
+        return values if self.index_x is None else values.index_select(0, self.index_x)
+
+    def columns_of(self, values: Tensor) -> Tensor:
+        """The columns that take part."""
+        return values if self.index_y is None else values.index_select(0, self.index_y)
+
+    def detached(self) -> Sides:
+        """The same, as constants."""
+        return self._replace(mu=self.mu.detach(), nu=self.nu.detach())
+
+
+def pick(mu: Tensor | None, nu: Tensor | None, sample: int, rows: int, columns: int, like: Tensor) -> Sides:
+    """Weights of one sample and where they are positive. Without mass on either side nothing is left of both."""
+    dtype = torch.promote_types(like.dtype, torch.float32)
+    sides: list[tuple[Tensor, Tensor | None]] = []
+    spreads = 0.0
+    for weight, size in ((mu, rows), (nu, columns)):
+        if weight is None:
+            sides.append((like.new_full((size,), 1 / size, dtype=dtype), None))
+            spreads += math.log(size)
+        else:
+            index = (weight[sample].detach() > 0).nonzero()[:, 0]
+            chosen = weight[sample].index_select(0, index)
+            spreads -= math.log(max(float(chosen.detach().amin()), 1e-300)) if len(chosen) else 0.0
+            sides.append((chosen, index))
+    if any(len(weight) == 0 for weight, _ in sides):
+        nothing = torch.empty(0, dtype=torch.int64, device=like.device)
+        sides = [(weight[:0], nothing) for weight, _ in sides]
+    (mu_s, index_x), (nu_s, index_y) = sides
+    return Sides(mu_s, nu_s, index_x, index_y, spreads)
+
+
+def weights(given: Tensor | None, mask: Tensor | None, like: Tensor, dtype: torch.dtype, side: str) -> Tensor | None:
+    """Weights ``(B, N)`` of the rows of ``like``; ``None`` if all are equal."""
+    batch, size = like.shape[:2]
+    check_mask(mask, batch, size, name=f"mask_{side}")
+    if given is None:
+        if mask is None:
+            return None
+        return mask.to(dtype) / mask.sum(1, keepdim=True).clamp_min(1)
+    name = "a" if side == "x" else "b"
+    if given.shape not in ((batch, size), (size,)):
+        raise ValueError(f"{name} must have shape {(batch, size)} or {(size,)}, got {tuple(given.shape)}")
+    if not bool((given.detach() >= 0).all() & given.detach().isfinite().all()):
+        raise ValueError(f"{name} must be finite and at least 0")
+    given = given.to(dtype).expand(batch, size)
+    return given if mask is None else torch.where(mask, given, 0.0)
+
+
+def check_totals(mu: Tensor | None, nu: Tensor | None) -> None:
+    """Balanced transport moves as much mass as there is room for; a side without any mass is let pass."""
+    if mu is None and nu is None:
+        return
+    totals = [torch.ones(1) if w is None else w.detach().sum(1).cpu() for w in (mu, nu)]
+    differ = (totals[0] - totals[1]).abs() > 1e-3 * totals[0].maximum(totals[1])
+    if bool((differ & (totals[0] > 0) & (totals[1] > 0)).any()):
+        raise ValueError(
+            f"a and b must have the same sum in every sample, got {totals[0].tolist()} and {totals[1].tolist()}; "
+            "normalise them, or give reach for unbalanced transport"
+        )

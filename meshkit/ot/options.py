@@ -1,0 +1,97 @@
+"""Options of the Sinkhorn functions, read and checked once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+from meshkit.ot.iterations import Settings
+from meshkit.ot.marginals import Sides
+
+Cost = Literal["cosine", "sqeuclidean", "dot"]
+Grad = Literal["unroll", "implicit", "last_step", "none"]
+Domain = Literal["auto", "kernel", "log"]
+Store = Literal["auto", "stream", "keep"]
+Eps = float | Tensor | Sequence[float]
+Reach = float | tuple[float | None, float | None] | None
+
+KEEP_BYTES = 1 << 30
+"""``store="auto"`` keeps kernels up to this size, all samples together."""
+
+
+class Options(NamedTuple):
+    """Options of :func:`sinkhorn`, read and checked."""
+
+    eps: float | Tensor
+    settings: Settings
+    domain: Domain
+    store: Store
+
+    @property
+    def unbalanced(self) -> bool:
+        """Constant shifts of the cost matter only then."""
+        return self.settings.power_x != 1.0 or self.settings.power_y != 1.0
+
+    def keep(self, size: int) -> bool:
+        """Whether to store the kernels, of so many bytes in all."""
+        return self.store == "keep" or (self.store == "auto" and size <= KEEP_BYTES)
+
+    def domain_for(self, spread: float, sides: Sides) -> str:
+        """``"kernel"`` if logits that differ by ``spread`` leave all scalings within the range of the dtype."""
+        if self.settings.scales:
+            return "log"
+        if self.domain != "auto":
+            return self.domain
+        return "kernel" if spread <= math.log(torch.finfo(sides.mu.dtype).max) - sides.log_smallest else "log"
+
+
+def read_options(
+    eps: Eps, n_iters: int, tol: float | None, reach: Reach, grad: str, domain: Domain, store: Store
+) -> Options:
+    """Check the options."""
+    for name, given, choices in (("grad", grad, Grad), ("domain", domain, Domain), ("store", store, Store)):
+        check_choice(name, given, choices)
+    if n_iters < 1:
+        raise ValueError(f"n_iters must be at least 1, got {n_iters}")
+    if tol is not None and not tol >= 0:
+        raise ValueError(f"tol must be None or at least 0, got {tol}")
+    scales: tuple[float, ...] = ()
+    if isinstance(eps, Sequence):
+        if not 1 <= len(eps) <= n_iters:
+            raise ValueError(f"eps has {len(eps)} values for n_iters = {n_iters}; give 1 to n_iters of them")
+        if any(isinstance(e, Tensor) for e in eps):
+            raise ValueError("a sequence of eps must hold numbers: it receives no gradient")
+        if domain == "kernel":
+            raise ValueError('a sequence of eps needs domain="log" or "auto"')
+        final = eps[-1]
+        scales = tuple(final / e if e > 0 else math.nan for e in (*eps, *[final] * (n_iters - len(eps))))
+        if math.nan in scales or not all(s > 0 for s in scales):
+            raise ValueError(f"every eps must be positive, got {list(eps)}")
+        eps = final
+    if isinstance(eps, Tensor) and eps.numel() != 1:
+        raise ValueError(f"eps as a tensor must hold one value, got shape {tuple(eps.shape)}")
+    value = float(eps.detach() if isinstance(eps, Tensor) else eps)
+    if not 0 < value < math.inf:
+        raise ValueError(f"eps must be positive and finite, got {value:g}")
+    powers = []
+    for side in reach if isinstance(reach, tuple) else (reach, reach):
+        if side is not None and not side > 0:
+            raise ValueError(f"reach must be positive, or None for an exact marginal, got {reach}")
+        powers.append(1.0 if side is None or side == math.inf else side / (side + value))
+    if scales and powers != [1.0, 1.0]:
+        raise ValueError("reach cannot be combined with a sequence of eps")
+    if isinstance(eps, Tensor) and eps.requires_grad and powers != [1.0, 1.0]:
+        raise ValueError("reach cannot be combined with a learned eps: its power would need a gradient too")
+    if isinstance(eps, Tensor):
+        eps = (eps.detach() if grad == "none" else eps).reshape(())
+    return Options(eps, Settings(n_iters, tol, powers[0], powers[1], grad, scales), domain, store)
+
+
+def check_choice(name: str, value: object, choices: object) -> None:
+    """``choices`` is a ``Literal``."""
+    if value not in get_args(choices):
+        raise ValueError(f"{name} must be one of {get_args(choices)}, got {value!r}")
