@@ -253,6 +253,25 @@ def test_the_pool_is_bounded(pooled, monkeypatch):
     assert len(workspace._free) == 3
 
 
+def test_a_buffer_may_come_back_while_another_is_lent(pooled):
+    """A finalizer runs wherever the cyclic collector does, in the middle of lending as well."""
+    plan = sinkhorn(rand(1, 9, 4), rand(1, 7, 4), store="keep")
+    with workspace._lock:
+        del plan  # would wait for ever if it took the lock
+    clear_workspace()
+    assert not workspace._free and not workspace._returned
+
+
+def test_products_with_tracked_values_take_one_sweep(monkeypatch):
+    fx, fy, v = rand(1, 9, 4), rand(1, 7, 4, seed=1), rand(1, 7, 2, seed=2).requires_grad_()
+    plan = sinkhorn(fx, fy)
+    sweeps = []
+    tiles = plan._samples[0].kernel.tiles
+    monkeypatch.setattr(tiles, "apply", lambda *args: sweeps.append(1) or type(tiles).apply(tiles, *args))
+    assert_near(plan @ v, plan.dense() @ v, 1e-13)
+    assert len(sweeps) == 2  # the product, and the row sums that dense asks for
+
+
 @domains
 def test_backward_twice(domain):
     fx, fy, v = leaves((2, 9, 4), (2, 7, 4), (2, 7, 2))

@@ -398,6 +398,7 @@ OPTION_ERRORS = [
     ({"eps": [1.0, 0.0, 0.5]}, r"every eps must be positive, got \[1\.0, 0\.0, 0\.5\]"),
     ({"eps": [1.0, -0.5]}, "every eps must be positive"),
     ({"eps": [-1.0, 0.5]}, "every eps must be positive"),
+    ({"eps": [1.0, torch.tensor(0.5)]}, "must hold numbers: it receives no gradient"),
     ({"eps": [1.0, 0.5], "domain": "kernel"}, 'a sequence of eps needs domain="log" or "auto"'),
     ({"eps": [1.0, 0.5], "reach": 1.0}, "reach cannot be combined with a sequence of eps"),
     ({"eps": torch.ones((), requires_grad=True), "reach": 1.0}, "reach cannot be combined with a learned eps"),
