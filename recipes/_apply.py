@@ -60,6 +60,6 @@ def warn(path: Path, verts: Tensor) -> None:
 
 def describe(path: Path, verts: Tensor, faces: Tensor, model: GeneratorConfig) -> Tensor:
     try:
-        return intrinsic_descriptors(verts, faces, num_signatures=model.num_signatures)[None]
+        return intrinsic_descriptors(verts, faces, num_signatures=model.num_signatures, method="fast")[None]
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None

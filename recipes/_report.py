@@ -101,14 +101,14 @@ def draw_sheet(run: Run, generator: nn.Module, pairs: PosePairs, device: torch.d
     generator.eval()
     result = generate(generator, batch)
     output = center(result.vertices)
-    warped = output if result.warped is None else center(result.warped)
+    warped = None if result.warped is None else center(result.warped)
     worst, sheet, captions = 0.15, [], []
     for b in range(rows):
         faces, truth = batch.identity_faces[b], batch.ground_truth[b]
         views = [
             (batch.identity[b], faces, None),
             (batch.pose[b], batch.pose_faces[b], None),
-            (warped[b], faces, None),
+            *([] if warped is None else [(warped[b], faces, None)]),
             (output[b], faces, None),
             (truth, faces, None),
             (output[b], faces, error_colors((output[b] - truth).norm(dim=1), vmax=worst)),
@@ -118,7 +118,7 @@ def draw_sheet(run: Run, generator: nn.Module, pairs: PosePairs, device: torch.d
         bounds = torch.stack([everything.amin(0), everything.amax(0)])
         sheet.append([render(verts, f, colors=colors, bounds=bounds) for verts, f, colors in views])
         score = 1e3 * float(pmd(output[b : b + 1], batch.ground_truth[b : b + 1]))
-        captions.append(["", "", "", f"PMD {score:.1f}e-3", "", ""])
+        captions.append([""] * (len(views) - 3) + [f"PMD {score:.1f}e-3", "", ""])
         for name, verts, f in (
             ("identity", batch.identity[b], faces),
             ("pose", batch.pose[b], batch.pose_faces[b]),
@@ -126,7 +126,7 @@ def draw_sheet(run: Run, generator: nn.Module, pairs: PosePairs, device: torch.d
             ("ground_truth", truth, faces),
         ):
             save_mesh(run.path("meshes") / f"pair{b}_{name}.obj", verts, f)
-    titles = ["identity", "pose", "warped", "output", "ground truth", "error"]
+    titles = ["identity", "pose", *([] if warped is None else ["warped"]), "output", "ground truth", "error"]
     contact_sheet(
         sheet, column_titles=titles, captions=captions, colorbar=(0.0, 100 * worst, "distance to ground truth (cm)")
     ).save(run.path("sheet.png"))

@@ -285,7 +285,12 @@ def test_extractor_under_autocast():
     ("options", "num", "given", "message"),
     [
         ({"k": 6}, 5, None, "k=6 neighbours .* smallest mesh of the batch has 5 vertices"),
-        ({"k": 3, "descriptors": 2}, 5, None, "takes 2 descriptor channels, got 0: compute them with .*wave_kernel"),
+        (
+            {"k": 3, "descriptors": 2},
+            5,
+            None,
+            "takes 2 descriptor channels, got 0: compute them with .*intrinsic_descriptors",
+        ),
         ({"k": 3, "descriptors": 2}, 5, (1, 5, 3), "takes 2 descriptor channels, got 3$"),
         ({"k": 3}, 5, (1, 5, 1), "takes 0 descriptor channels, got 1$"),
     ],
@@ -300,3 +305,18 @@ def test_extractor_error_counts_real_vertices():
     mask = torch.tensor([[True] * 6, [True] * 3 + [False] * 3])
     with pytest.raises(ValueError, match="has 3 vertices"):
         SetConvExtractor((4,), k=4)(rand(2, 6, 3, dtype=torch.float32), mask=mask)
+
+
+def test_extractor_wants_coordinates():
+    with pytest.raises(ValueError, match=r"positions must have shape \(B, N, 3\), got \(1, 20, 6\)"):
+        SetConvExtractor((4,), k=4)(torch.randn(1, 20, 6))
+
+
+def test_moments_of_the_graph_stay_in_float32_under_autocast():
+    """In float16 the covariance of positions in centimetres would overflow."""
+    positions = 50 * rand(1, 60, 3).float()
+    conv = SetConv(3, 4)
+    neighbors = knn(positions, 6)
+    with torch.autocast("cpu", torch.float16):
+        value = conv(positions, positions, neighbors)
+    assert_near(value.float(), conv(positions, positions, neighbors), 2e-2)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 from torch.nn.functional import conv1d
 
+from meshkit import norm as norms
 from meshkit.norm import (
     SPADE,
     AdaIN,
@@ -665,3 +666,27 @@ def test_statistics_under_vmap():
     for b in range(3):
         for value, expected in zip((mean[b], std[b]), instance_statistics(x[b]), strict=True):
             assert_near(value, expected, 1e-14)
+
+
+@pytest.mark.parametrize("name", ["instance_norm", "adain", "spadain", "elain"])
+def test_padding_of_functional_forms_reaches_no_gradient(name):
+    x = rand(2, 6, 3)
+    x[1, 4:] = float("nan")
+    x.requires_grad_()
+    mask = torch.tensor([[True] * 6, [True] * 4 + [False] * 2])
+    beside = rand(2, 6, 3, seed=1)
+    calls = {
+        "instance_norm": lambda: norms.instance_norm(x, mask=mask),
+        "adain": lambda: norms.adain(x, beside, mask=mask),
+        "spadain": lambda: norms.spadain(x, beside, beside, mask=mask),
+        "elain": lambda: norms.elain(x, beside, beside, weight=torch.full((1, 1, 3), 0.3).double(), mask=mask),
+    }
+    (gradient,) = torch.autograd.grad(calls[name]().square().sum(), x)
+    assert gradient[mask].isfinite().all() and not gradient[~mask].any()
+
+
+def test_condition_in_another_dtype_is_converted():
+    for make in (ElaIN, SPAdaIN, AdaIN, SoftAdaIN, SPADE):
+        norm = make(4, 5).eval()
+        x, cond = rand(1, 7, 4).float(), rand(1, 7, 5, seed=1)
+        assert_near(norm(x, cond), norm(x, cond.float()), 1e-6)

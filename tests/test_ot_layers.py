@@ -132,7 +132,7 @@ def test_divergence_of_points_that_are_not_finite_ends(bad):
     [
         ({"eps": 0.0}, "eps must be positive"),
         ({"anneal": 1.0}, "0 < factor < 1"),
-        ({"n_iters": 0}, "n_iters must be at least 1"),
+        ({"n_iters": 0}, "n_iters must be an integer of at least 1"),
         ({"cost": "l1"}, "cost must be one of"),
         ({"mask_x": torch.ones(1, 5, dtype=torch.bool)}, "mask_x must have shape"),
         ({"a": torch.ones(4)}, "a and b must have the same sum"),
@@ -227,7 +227,7 @@ def test_dustbin_takes_what_has_no_match():
     [
         ((4, 3), {}, r"scores must be \(B, N, M\) .* got \(4, 3\)"),
         ((1, 0, 3), {}, r"scores must be .* got \(1, 0, 3\)"),
-        ((1, 4, 3), {"n_iters": 0}, "n_iters must be at least 1"),
+        ((1, 4, 3), {"n_iters": 0}, "n_iters must be an integer of at least 1"),
         ((1, 4, 3), {"mask_x": torch.ones(1, 3, dtype=torch.bool)}, "mask_x must have shape"),
         ((1, 4, 3), {"mask_y": torch.ones(1, 4, dtype=torch.bool)}, "mask_y must have shape"),
         ((1, 4, 3), {"mask_x": torch.zeros(1, 4, dtype=torch.bool)}, "at least one real row and one real column"),
@@ -316,3 +316,18 @@ def test_schedule_of_the_divergence_fits_its_iterations():
     assert len(eps_schedule(100.0, 0.01)) > 3
     short = sinkhorn_divergence(x, y, eps=0.01, n_iters=3)
     assert short.isfinite().all() and abs(short - sinkhorn_divergence(x, y, eps=0.01, n_iters=500)) < 0.5 * short.abs()
+
+
+def test_divergence_of_a_sample_without_points_is_zero():
+    x, y = rand(2, 6, 3).requires_grad_(), rand(2, 5, 3, seed=1)
+    mask = torch.ones(2, 6, dtype=torch.bool)
+    mask[1] = False
+    value = sinkhorn_divergence(x, y, mask_x=mask)
+    assert value[0] > 0 and value[1] == 0
+    (gradient,) = torch.autograd.grad(value.sum(), x)
+    assert gradient[0].abs().sum() > 0 and not gradient[1].any()
+
+
+def test_divergence_needs_a_number_for_eps():
+    with pytest.raises(ValueError, match="eps must be a number, got list"):
+        sinkhorn_divergence(rand(1, 4, 3), rand(1, 5, 3), eps=[0.1, 0.01])

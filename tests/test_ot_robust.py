@@ -393,8 +393,10 @@ OPTION_ERRORS = [
     ({"eps": math.inf}, "eps must be positive and finite, got inf"),
     ({"eps": torch.zeros(())}, "eps must be positive"),
     ({"eps": torch.ones(2)}, r"eps as a tensor must hold one value, got shape \(2,\)"),
-    ({"eps": []}, "eps has 0 values for n_iters = 5"),
-    ({"eps": [1.0] * 6}, "eps has 6 values for n_iters = 5; give 1 to n_iters of them"),
+    ({"eps": []}, "a sequence of eps needs at least one value"),
+    ({"eps": "0.1"}, "eps must be a number, a scalar tensor or a sequence of numbers, got str"),
+    ({"n_iters": 2.5}, "n_iters must be an integer of at least 1, got 2.5"),
+    ({"reach": [1.0, 2.0, 3.0]}, "reach must be None, a number, or a pair"),
     ({"eps": [1.0, 0.0, 0.5]}, r"every eps must be positive, got \[1\.0, 0\.0, 0\.5\]"),
     ({"eps": [1.0, -0.5]}, "every eps must be positive"),
     ({"eps": [-1.0, 0.5]}, "every eps must be positive"),
@@ -402,7 +404,7 @@ OPTION_ERRORS = [
     ({"eps": [1.0, 0.5], "domain": "kernel"}, 'a sequence of eps needs domain="log" or "auto"'),
     ({"eps": [1.0, 0.5], "reach": 1.0}, "reach cannot be combined with a sequence of eps"),
     ({"eps": torch.ones((), requires_grad=True), "reach": 1.0}, "reach cannot be combined with a learned eps"),
-    ({"n_iters": 0}, "n_iters must be at least 1, got 0"),
+    ({"n_iters": 0}, "n_iters must be an integer of at least 1, got 0"),
     ({"tol": -1e-3}, r"tol must be None or at least 0, got -0\.001"),
     ({"tol": math.nan}, "tol must be None or at least 0, got nan"),
     ({"reach": 0.0}, r"reach must be positive, or None for an exact marginal, got 0\.0"),
@@ -492,3 +494,64 @@ def test_implicit_gradient_of_one_potential_leaves_its_free_constant_out(domain)
     for gradient, centred, truth in zip(*gradients, truths, strict=True):
         assert_near(centred, truth, 1e-9)
         assert_near(gradient, truth, 1e-9)
+
+
+def test_features_must_be_floating_point_tensors():
+    for features in (X.long(), X.numpy()):
+        with pytest.raises(ValueError, match=r"features must be floating-point tensors, got .*torch\.as_tensor"):
+            sinkhorn(features, Y)
+
+
+@pytest.mark.parametrize("cost", ["cosine", "sqeuclidean", "dot"])
+def test_mixed_precision_inputs_are_promoted(cost):
+    plan = sinkhorn(X.float(), Y.double(), cost=cost, eps=1.0)
+    assert plan.dtype == torch.float64
+    assert_near(plan.dense(), sinkhorn(X.float().double(), Y.double(), cost=cost, eps=1.0).dense(), 1e-12)
+
+
+def test_a_schedule_longer_than_n_iters_is_run_to_its_end():
+    schedule = eps_schedule(1.0, 0.05)
+    plan = sinkhorn(X.double(), Y.double(), eps=schedule)
+    assert plan.n_iters == [len(schedule)] and len(schedule) > 5
+
+
+def test_auto_domain_does_not_depend_on_the_scale_of_the_weights():
+    fx, fy = torch.zeros(1, 1, 1), torch.full((1, 1, 1), 110.0**0.5)
+    plan = sinkhorn(fx, fy, cost="sqeuclidean", eps=1.0, a=torch.full((1,), 1e6), b=torch.full((1,), 1e6))
+    assert_near(plan.dense(), torch.full((1, 1, 1), 1e6), 1e-5)
+
+
+def test_tolerance_is_a_share_of_the_total():
+    fx, fy = rand(1, 8, 3), rand(1, 9, 3, seed=1)
+    mu, nu = torch.full((8,), 1 / 8, dtype=torch.float64), torch.full((9,), 1 / 9, dtype=torch.float64)
+    counts = [sinkhorn(fx, fy, eps=0.1, n_iters=500, tol=1e-6, a=s * mu, b=s * nu).n_iters for s in (1, 3e5)]
+    assert counts[0] == counts[1] and 5 < counts[0][0] < 500
+
+
+def test_nearest_entries_under_autocast_are_those_of_float32():
+    fx, fy = rand(1, 50, 16).float(), rand(1, 40, 16, seed=1).float()
+    fx = fx[:, :1] + 1e-2 * fx  # close neighbours, which bfloat16 cannot tell apart
+    fy = fx[:, :40] + 1e-3 * fy
+    expected = sinkhorn(fx, fy, eps=0.01)
+    with torch.autocast("cpu", torch.bfloat16):
+        plan = sinkhorn(fx, fy, eps=0.01)
+        assert torch.equal(plan.argmax(), expected.argmax()) and torch.equal(plan.argmax(1), expected.argmax(1))
+        assert all(torch.equal(a, b) for a, b in zip(plan.mutual(), expected.mutual(), strict=True))
+        assert torch.equal(plan.topk(3)[1], expected.topk(3)[1])
+
+
+def test_plans_say_what_they_are_and_take_negative_dimensions():
+    plan = sinkhorn(X, Y)
+    assert "shape=(1, 4, 5)" in repr(plan) and "eps=0.03" in repr(plan)
+    assert torch.equal(plan.argmax(-1), plan.argmax(2)) and torch.equal(plan.argmax(-2), plan.argmax(1))
+
+
+def test_pages_of_passes_that_do_not_reach_the_kernel_do_not_pile_up():
+    fx, values = rand(1, 4, 3).requires_grad_(), rand(1, 5, 2).requires_grad_()
+    plan = sinkhorn(fx, rand(1, 5, 3, seed=1))
+    out = plan.barycentric(values).sum()
+    expected = torch.autograd.grad(out, fx, retain_graph=True)[0]
+    for _ in range(5):
+        torch.autograd.grad(out, values, retain_graph=True)
+    assert len(plan._samples[0].kernel.ledger._pages) <= 2
+    assert_near(torch.autograd.grad(out, fx)[0], expected, 1e-13)

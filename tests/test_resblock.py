@@ -286,3 +286,9 @@ def test_two_forwards_under_distributed_data_parallel(tmp_path):
         assert_gradients_near([p.grad for p in block.parameters()], [p.grad for p in twin.parameters()], 1e-12)
     finally:
         torch.distributed.destroy_process_group()
+
+
+@pytest.mark.parametrize("norm", ["elain", SPAdaIN(C, D)])
+def test_norm_must_be_a_factory(norm):
+    with pytest.raises(ValueError, match=r"called as norm\(num_features, cond_features\)"):
+        ConditionalResBlock(C, D, norm=norm)

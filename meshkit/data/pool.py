@@ -55,7 +55,7 @@ class MeshPool:
         workers: int = 1,
         progress: bool = False,
     ) -> MeshPool:
-        """Draw ``size`` (identity, pose) combinations and compute their intrinsic descriptors.
+        """Draw ``size`` (identity, pose) combinations and compute their intrinsic descriptors, by the fast method.
 
         Args:
             model: body with tables of identities and poses.
@@ -140,6 +140,8 @@ def _one_thread_each() -> Iterator[None]:
 
 def _signature(verts: object, *, faces: Tensor, num_signatures: int, num_eigenpairs: int) -> object:
     points = torch.as_tensor(verts)
-    result = intrinsic_descriptors(points, faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs)
+    result = intrinsic_descriptors(
+        points, faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs, method="fast"
+    )
     # NumPy arrays cross process borders by value; tensors would go through shared memory handles.
     return result.numpy()

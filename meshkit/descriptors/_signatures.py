@@ -23,7 +23,8 @@ def wave_bands(count: int, width: float) -> Bands:
 
     def bands(eigenvalues: Tensor) -> tuple[Tensor, Tensor]:
         log_values = eigenvalues.log()
-        energies = torch.linspace(float(log_values[0]), 0.98 * float(log_values[-1]), count).to(log_values)
+        first, last = float(log_values[0]), 0.98 * float(log_values[-1])
+        energies = torch.linspace(first, last, count, dtype=log_values.dtype)
         spread = width * (energies[1] - energies[0]).abs().clamp_min(1e-9)
         weights = torch.exp(-(energies[:, None] - log_values).square() / (2 * spread**2))
         return weights / weights.sum(1, keepdim=True), torch.zeros_like(energies)

@@ -64,7 +64,10 @@ class PointwiseExtractor(nn.Module):
         check_mask(mask, *positions.shape[:2])
         given = 0 if descriptors is None else descriptors.shape[-1]
         if given != self.descriptors:
-            raise ValueError(f"this extractor takes {self.descriptors} descriptor channels, got {given}")
+            raise ValueError(
+                f"this extractor takes {self.descriptors} descriptor channels, got {given}"
+                + ("" if given else ": compute them with meshkit.descriptors.intrinsic_descriptors")
+            )
         x = positions if descriptors is None else torch.cat([positions, descriptors.to(positions.dtype)], 2)
         if mask is not None:
             x = x.masked_fill(~mask[..., None], 0.0)

@@ -63,6 +63,11 @@ class ConditionalResBlock(nn.Module):
         super().__init__()
         if slope < 0:
             raise ValueError(f"slope must not be negative, got {slope}")
+        if not callable(norm) or isinstance(norm, nn.Module):
+            raise ValueError(
+                f"norm must be a class or function called as norm(num_features, cond_features), got {norm!r}; bind "
+                "options with functools.partial"
+            )
         self.slope = slope
         wrap: Callable[[nn.Module], Any] = spectral_norm if spectral else lambda layer: layer
         self.norm_0, self.norm_1, self.norm_s = (norm(num_features, cond_features) for _ in range(3))

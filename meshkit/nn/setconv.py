@@ -121,7 +121,11 @@ class Neighborhoods(NamedTuple):
 @torch.no_grad()
 def neighborhoods(positions: Tensor, neighbors: Tensor, mask: Tensor | None) -> Neighborhoods:
     """What :class:`SetConv` needs to know of its graph."""
-    positions = positions.to(torch.promote_types(positions.dtype, torch.float32))
+    with torch.autocast(positions.device.type, enabled=False):
+        return _neighborhoods(positions.to(torch.promote_types(positions.dtype, torch.float32)), neighbors, mask)
+
+
+def _neighborhoods(positions: Tensor, neighbors: Tensor, mask: Tensor | None) -> Neighborhoods:
     batch, num, k = neighbors.shape
     if mask is None:
         real = positions.new_ones(batch, num, 1)
@@ -173,11 +177,15 @@ class SetConvExtractor(nn.Module):
 
     def forward(self, positions: Tensor, *, descriptors: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Features of each vertex."""
+        if positions.dim() != 3 or positions.shape[2] != 3:
+            raise ValueError(
+                f"positions must have shape (B, N, 3), got {tuple(positions.shape)}; further channels go to descriptors"
+            )
         given = 0 if descriptors is None else descriptors.shape[-1]
         if given != self.descriptors:
             raise ValueError(
                 f"this extractor takes {self.descriptors} descriptor channels, got {given}"
-                + ("" if given else ": compute them with meshkit.descriptors.wave_kernel_signature")
+                + ("" if given else ": compute them with meshkit.descriptors.intrinsic_descriptors")
             )
         if mask is not None:
             positions = positions.masked_fill(~mask[..., None], 0.0)

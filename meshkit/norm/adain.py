@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from meshkit.batching import masked_mean
 from meshkit.norm.base import ConditionalNorm
 from meshkit.norm.modulation import Modulation
-from meshkit.norm.statistics import instance_statistics
+from meshkit.norm.statistics import instance_statistics, zero_padding
 
 __all__ = ["AdaIN", "SoftAdaIN", "adain", "soft_adain"]
 
@@ -92,9 +92,9 @@ def soft_adain(
         )
     mean, std = instance_statistics(x, mask=mask, eps=eps)
     style_mean, style_std = instance_statistics(style, mask=style_mask, eps=eps)
-    y = torch.lerp(std, style_std, weight.to(std.dtype)) * ((x - mean) / std)
+    y = torch.lerp(std, style_std, weight.to(std.dtype)) * ((zero_padding(x, mask) - mean) / std)
     y = (y + torch.lerp(mean, style_mean, weight.to(mean.dtype))).to(x.dtype)
-    return y if mask is None else torch.where(mask[..., None], y, 0)
+    return zero_padding(y, mask)
 
 
 class AdaIN(ConditionalNorm):
@@ -145,8 +145,8 @@ class AdaIN(ConditionalNorm):
     def _style(self, cond: Tensor, cond_mask: Tensor | None) -> tuple[Tensor, Tensor]:
         """Mean and deviation ``(B, 1, C)`` of ``shared(cond)``, at least in float32."""
         with torch.autocast(cond.device.type, enabled=False):
-            weight, bias = self.shared.weight, self.shared.bias
-            cond = cond.to(torch.promote_types(cond.dtype, weight.dtype))
+            dtype = torch.promote_types(torch.promote_types(cond.dtype, self.shared.weight.dtype), torch.float32)
+            cond, weight, bias = (t.to(dtype) for t in (cond, self.shared.weight, self.shared.bias))
             cond_mean = masked_mean(cond, cond_mask)[:, None]
             centred = cond - cond_mean
             count: Tensor | int = cond.shape[1]

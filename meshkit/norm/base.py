@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from meshkit.batching import check_mask
 from meshkit.norm.modulation import Modulation, modulate
-from meshkit.norm.statistics import instance_statistics
+from meshkit.norm.statistics import instance_statistics, zero_padding
 
 __all__ = ["ConditionalNorm"]
 
@@ -23,7 +23,8 @@ class ConditionalNorm(nn.Module):
     Shape:
         ``x (B, N, C)`` and ``cond (B, M, D)`` with masks ``(B, N)`` and ``(B, M)``; the result is ``(B, N, C)`` in the
         dtype of ``x``, 0 at padded vertices. Where ``per_vertex``, M = N, row n of ``cond`` belongs to vertex
-        n of ``x``, and ``cond_mask`` is ``mask`` unless given. Otherwise ``cond`` may have any number of rows.
+        n of ``x``. Otherwise ``cond`` may have any number of rows. Where it has as many as ``x``, ``cond_mask`` is
+        ``mask`` unless given.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -74,15 +75,13 @@ class ConditionalNorm(nn.Module):
                 f"expected x with {self.num_features} and cond with {self.cond_features} channels, "
                 f"got {x.shape[2]} and {cond.shape[2]}"
             )
-        if self.per_vertex and cond_mask is None:
+        if cond_mask is None and cond.shape[1] == x.shape[1]:
             cond_mask = mask
         check_mask(mask, *x.shape[:2])
         check_mask(cond_mask, *cond.shape[:2], name="cond_mask")
-        if mask is not None:
-            x = x.masked_fill(~mask[..., None], 0.0)
-        if cond_mask is not None:
-            cond = cond.masked_fill(~cond_mask[..., None], 0.0)
-        return x, cond, cond_mask
+        if cond.dtype != x.dtype and not torch.is_autocast_enabled(x.device.type):
+            cond = cond.to(x.dtype)
+        return zero_padding(x, mask), zero_padding(cond, cond_mask), cond_mask
 
     def statistics(self, x: Tensor, *, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Mean and deviation ``(B, 1, C)`` that ``x`` is normalised by."""
@@ -95,4 +94,4 @@ class ConditionalNorm(nn.Module):
 
     def modulation(self, cond: Tensor, mean: Tensor, std: Tensor, *, cond_mask: Tensor | None = None) -> Modulation:
         """Scale and shift for a condition whose padded rows are zero, given the statistics of ``x``."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must define modulation(cond, mean, std, *, cond_mask=None)")

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from meshkit.batching import masked_mean
 from meshkit.norm.base import ConditionalNorm
 from meshkit.norm.modulation import Modulation, compose
-from meshkit.norm.statistics import instance_statistics
+from meshkit.norm.statistics import instance_statistics, zero_padding
 
 __all__ = ["ElaIN", "elain"]
 
@@ -60,8 +60,9 @@ def elain(
     check_variant(variant)
     mean, std = instance_statistics(x, mask=mask, unbiased=variant == "released", eps=eps)
     scale = OFFSET[variant] + weight * gamma + (1 - weight) * std
-    y = (scale * ((x - mean) / std) + weight * beta + (1 - weight) * mean).to(x.dtype)
-    return y if mask is None else torch.where(mask[..., None], y, 0)
+    scale = zero_padding(scale.expand_as(x), mask)
+    y = (scale * ((zero_padding(x, mask) - mean) / std) + weight * beta + (1 - weight) * mean).to(x.dtype)
+    return zero_padding(y, mask)
 
 
 class ElaIN(ConditionalNorm):

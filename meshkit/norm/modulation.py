@@ -79,8 +79,10 @@ def modulate(
     device = x.device.type
     autocast = torch.is_autocast_enabled(device)
     dtype = torch.get_autocast_dtype(device) if autocast and x.dtype != torch.float64 else x.dtype
-    mean, scale_bias, shift_bias, *factors = modulation
-    cast = (None if tensor is None else tensor.to(dtype) for tensor in (*factors, weight, bias))
+    *vectors, features, scale_weight, shift_weight = modulation
+    mean, scale_bias, shift_bias = (t.expand(len(x), 1, x.shape[2]) for t in vectors)
+    factors = (features, scale_weight, shift_weight, weight, bias)
+    cast = (None if tensor is None else tensor.to(dtype) for tensor in factors)
     inputs: tuple[Any, ...] = (x, mean, scale_bias, shift_bias, *cast, slope)
     with torch.autocast(device, enabled=False):
         return _formula(*inputs) if traced() else _Modulate.apply(*inputs)

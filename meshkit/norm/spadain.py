@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 
 from meshkit.norm.base import ConditionalNorm
 from meshkit.norm.modulation import Modulation
-from meshkit.norm.statistics import instance_norm
+from meshkit.norm.statistics import instance_norm, zero_padding
 
 __all__ = ["SPAdaIN", "spadain"]
 
@@ -34,11 +33,12 @@ def spadain(x: Tensor, gamma: Tensor, beta: Tensor, *, mask: Tensor | None = Non
         Wang et al., "Neural pose transfer by spatially adaptive instance normalization", Equation 1.
 
     Example:
+        >>> import torch
         >>> spadain(torch.tensor([[[1.0], [3.0]]]), torch.tensor(5.0), torch.tensor(7.0), eps=0.0).flatten().tolist()
         [2.0, 12.0]
     """
     y = (gamma * instance_norm(x, mask=mask, eps=eps) + beta).to(x.dtype)
-    return y if mask is None else torch.where(mask[..., None], y, 0)
+    return zero_padding(y, mask)
 
 
 class SPAdaIN(ConditionalNorm):
@@ -61,6 +61,7 @@ class SPAdaIN(ConditionalNorm):
         Wang et al., "Neural pose transfer by spatially adaptive instance normalization", Equation 1.
 
     Example:
+        >>> import torch
         >>> SPAdaIN(64, 3)(torch.randn(2, 100, 64), torch.randn(2, 100, 3)).shape
         torch.Size([2, 100, 64])
     """

@@ -71,8 +71,13 @@ def instance_norm(x: Tensor, *, mask: Tensor | None = None, unbiased: bool = Fal
         [-1.0, 1.0]
     """
     mean, std = instance_statistics(x, mask=mask, unbiased=unbiased, eps=eps)
-    y = ((x - mean) / std).to(x.dtype)
-    return y if mask is None else torch.where(mask[..., None], y, 0)
+    x = zero_padding(x, mask)
+    return zero_padding(((x - mean) / std).to(x.dtype), mask)
+
+
+def zero_padding(x: Tensor, mask: Tensor | None) -> Tensor:
+    """Zero at padded rows, before arithmetic too: what is not finite there would reach the gradient otherwise."""
+    return x if mask is None else x.masked_fill(~mask[..., None], 0.0)
 
 
 def _count(x: Tensor, mask: Tensor | None) -> Tensor:

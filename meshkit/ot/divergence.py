@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from meshkit.batching import check_mask
@@ -52,8 +53,9 @@ def sinkhorn_divergence(
         eps: regularisation in units of the cost, for ``"sqeuclidean"`` the square of a length. GeomLoss's
             cost is half the squared distance, so its ``blur`` is ``eps = 2 * blur ** 2`` here and values are twice its.
         n_iters: largest number of iterations, those of annealing included.
-        tol: stop when the column sums are this close to their weights.
-        anneal: start at the largest cost and lower eps by this factor per iteration; ``None`` starts at ``eps``.
+        tol: stop when the column sums are this close to their weights, as a share of their total.
+        anneal: start at the largest cost of the batch and lower eps by this factor per iteration; ``None``, and
+            ``domain="kernel"``, start at ``eps``.
         a: ``(B, N)`` or ``(N,)`` weights of x, uniform with sum 1 by default.
         b: weights of y.
         mask_x: ``(B, N)`` bool, True = real point.
@@ -63,7 +65,8 @@ def sinkhorn_divergence(
         store: see :func:`~meshkit.ot.sinkhorn`.
 
     Returns:
-        ``(B,)`` in units of the cost, differentiable in points and weights.
+        ``(B,)`` in units of the cost, differentiable in points and weights; 0 for a sample without any real point on
+        one side.
 
     Raises:
         ValueError: as :func:`~meshkit.ot.sinkhorn`.
@@ -80,6 +83,9 @@ def sinkhorn_divergence(
         >>> round(shifted.item(), 3)
         9.0
     """
+
+    if not isinstance(eps, int | float):
+        raise ValueError(f"eps must be a number, got {type(eps).__name__}; use anneal to lower it in steps")
 
     def transport(first: Side, second: Side) -> Tensor:
         schedule: float | list[float] = eps
@@ -107,7 +113,9 @@ def sinkhorn_divergence(
     check_mask(mask_y, *y.shape[:2], name="mask_y")
     mu, nu = Side(x, a, mask_x), Side(y, b, mask_y)
     value = transport(mu, nu)
-    return value - (transport(mu, mu) + transport(nu, nu)) / 2 if debias else value
+    if debias:
+        value = value - (transport(mu, mu) + transport(nu, nu)) / 2
+    return torch.where(mu.alive() & nu.alive(), value, 0.0)
 
 
 class Side(NamedTuple):
@@ -116,6 +124,13 @@ class Side(NamedTuple):
     points: Tensor
     weights: Tensor | None
     mask: Tensor | None
+
+    def alive(self) -> Tensor:
+        """Samples with any mass, ``(B,)``."""
+        alive = torch.ones(self.points.shape[:2], dtype=torch.bool, device=self.points.device)
+        for weights in (self.weights, self.mask):
+            alive = alive if weights is None else alive & (weights > 0)
+        return alive.any(1)
 
 
 def _dual_value(sample: SamplePlan) -> Tensor:

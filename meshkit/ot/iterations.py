@@ -101,7 +101,7 @@ class _KernelIterations(torch.autograd.Function):
         rows, columns = scalings[:steps], scalings[steps:]
         if settings.grad == "implicit":
             factors, grad_mu, grad_nu = _implicit(tiles, mu, nu, columns[-1], None, grad_b * columns[-1], settings)
-            token = ctx.ledger.hand_in(ctx.needs_input_grad[0], *factors)
+            token = ctx.ledger.hand_in(ctx, *factors)
             return token, grad_mu, grad_nu, None, None
         grad_mu, grad_nu = torch.zeros_like(mu), torch.zeros_like(nu)
         lefts, rights = [], []
@@ -112,17 +112,16 @@ class _KernelIterations(torch.autograd.Function):
             # log b = p_y (log nu - log c), c = Kᵀ a
             grad_log_b *= settings.power_y
             grad_nu += grad_log_b / nu
-            grad_c = -grad_log_b / column_sums(nu, b, settings.power_y)
+            grad_c = -grad_log_b / kernel_sums(nu, b, settings.power_y)
             lefts.append(a)
             rights.append(grad_c)
-            if t == 0:
-                grad_mu += tiles.apply(grad_c[:, None])[:, 0]
-                break
             if t == last:
+                if t == 0 and ctx.needs_input_grad[1]:  # a_0 is mu
+                    grad_mu += tiles.apply(grad_c[:, None])[:, 0]
                 break
             # log a = p_x (log mu - log r), r = K b_{t-1}
             b = columns[t - 1]
-            sums = column_sums(mu, a, settings.power_x)
+            sums = kernel_sums(mu, a, settings.power_x)
             grad_log_a, gathered = torch.empty_like(a), torch.zeros_like(b)
             for block, entries in tiles.entries(None):
                 grad_log_a[block] = settings.power_x * a[block] * torch.mv(entries, grad_c)
@@ -132,17 +131,20 @@ class _KernelIterations(torch.autograd.Function):
             rights.append(b)
             grad_log_b = b * gathered
         joined = Factors(torch.stack(lefts, 1), torch.stack(rights, 1), None)
-        return ctx.ledger.hand_in(ctx.needs_input_grad[0], joined), grad_mu, grad_nu, None, None
+        return ctx.ledger.hand_in(ctx, joined), grad_mu, grad_nu, None, None
 
 
-def column_sums(weights: Tensor, scaling: Tensor, power: float) -> Tensor:
+def kernel_sums(weights: Tensor, scaling: Tensor, power: float) -> Tensor:
     """The kernel sums that gave ``scaling = (weights / sums) ** power``."""
     return weights / (scaling if power == 1.0 else scaling.pow(1 / power))
 
 
 def converged(b: Tensor, previous: Tensor, nu: Tensor, tol: float) -> bool:
-    """Whether the column sums nu * previous / b of the plan before this half step are within ``tol`` of nu."""
-    return float((nu * (previous / b - 1)).abs().sum()) < tol
+    """Whether the column sums nu * previous / b of the plan before this half step are within ``tol`` of nu.
+
+    As a share of the total.
+    """
+    return bool((nu * (previous / b - 1)).abs().sum() < tol * nu.sum())
 
 
 class _LogIterations(torch.autograd.Function):
@@ -196,7 +198,7 @@ class _LogIterations(torch.autograd.Function):
         if settings.grad == "implicit":
             final = Reference(settings.power_x * (log_mu - row_sums[-1]), betas[-1])
             factors, grad_mu, grad_nu = _implicit(tiles, mu, nu, torch.ones_like(nu), final, grad_b, settings)
-            token = ctx.ledger.hand_in(ctx.needs_input_grad[0], *factors)
+            token = ctx.ledger.hand_in(ctx, *factors)
             return token, grad_mu, grad_nu, None, None, None
         grad_mu, grad_nu = torch.zeros_like(mu), torch.zeros_like(nu)
         handed_in = []
@@ -209,12 +211,12 @@ class _LogIterations(torch.autograd.Function):
             grad_nu += grad_log_b
             columns = Reference(alphas[t], log_nu - sums_of_columns[t], scales[t])
             handed_in.append(Factors(ones_x[:, None], -scales[t] * grad_log_b[:, None], columns))
-            if t == last and last > 0:
+            wanted = ctx.needs_input_grad[1] and not ctx.given_start  # a_0 is mu
+            if t == last and not (t == 0 and wanted):
                 break
             grad_log_a = -tiles.apply(grad_log_b[:, None], columns)[:, 0]
             if t == 0:
-                if not ctx.given_start:
-                    grad_mu += grad_log_a / mu
+                grad_mu += grad_log_a / mu
                 break
             if scales[t] != scales[t - 1]:
                 ratio = scales[t] / scales[t - 1]
@@ -226,7 +228,7 @@ class _LogIterations(torch.autograd.Function):
             rows = Reference(log_mu - row_sums[t - 1], betas[t - 1], scales[t - 1])
             handed_in.append(Factors(-scales[t - 1] * grad_log_a[:, None], ones_y[:, None], rows))
             grad_log_b = -tiles.apply_transpose(grad_log_a[:, None], rows)[:, 0]
-        return ctx.ledger.hand_in(ctx.needs_input_grad[0], *handed_in), grad_mu, grad_nu, None, None, None
+        return ctx.ledger.hand_in(ctx, *handed_in), grad_mu, grad_nu, None, None, None
 
 
 def _implicit(

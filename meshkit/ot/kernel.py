@@ -53,19 +53,23 @@ class Ledger:
 
     def __init__(self, tiles: Tiles) -> None:
         self.tiles = tiles
-        self._pages: list[list[Factors]] = []
+        self._pages: dict[int, tuple[Factors, ...]] = {}
 
-    def hand_in(self, token: bool, *factors: Factors) -> Tensor | None:
-        """Keep the factors of one user's backward pass; returns its gradient for the kernel's token, a count."""
-        if not token:
+    def hand_in(self, user: Any, *factors: Factors) -> Tensor | None:
+        """Keep the factors of one user's backward pass; returns its gradient for the kernel's token, a count.
+
+        A page replaces the one that the same user left in a pass which did not ask for the kernel's gradient.
+        """
+        if not user.needs_input_grad[0]:
             return None
-        self._pages.append(list(factors))
+        self._pages.pop(id(user), None)
+        self._pages[id(user)] = factors
         return factors[0].left.new_ones(())
 
     def collect(self, count: int) -> list[Factors]:
         """The factors of this backward pass. Earlier pages stem from passes that did not ask for this gradient."""
-        pages, self._pages = self._pages[len(self._pages) - count :], []
-        return [factors for page in pages for factors in page]
+        pages, self._pages = list(self._pages.values()), {}
+        return [factors for page in pages[len(pages) - count :] for factors in page]
 
 
 class GibbsKernel:
@@ -124,7 +128,7 @@ class _Product(torch.autograd.Function):
             multiply = tiles.apply if ctx.transpose else tiles.apply_transpose
             grad_columns = multiply(gradient, ctx.reference)
         left, right = (columns, gradient) if ctx.transpose else (gradient, columns)
-        token = ctx.ledger.hand_in(ctx.needs_input_grad[0], Factors(left, right, ctx.reference))
+        token = ctx.ledger.hand_in(ctx, Factors(left, right, ctx.reference))
         return token, grad_columns, None, None, None
 
 

@@ -142,8 +142,16 @@ class CorrespondenceWarp(nn.Module):
         self.normalize = normalize
 
     def forward(
-        self, fx: Tensor, fy: Tensor, values: Tensor, *, mask_x: Tensor | None = None, mask_y: Tensor | None = None
+        self,
+        fx: Tensor,
+        fy: Tensor,
+        values: Tensor,
+        *,
+        a: Tensor | None = None,
+        b: Tensor | None = None,
+        mask_x: Tensor | None = None,
+        mask_y: Tensor | None = None,
     ) -> tuple[Tensor, TransportPlan]:
-        """Warp ``values`` of the columns to the rows."""
-        plan = self.correspondence(fx, fy, mask_x=mask_x, mask_y=mask_y)
+        """Warp ``values`` of the columns to the rows; ``a`` and ``b`` are the weights of rows and columns."""
+        plan = self.correspondence(fx, fy, a=a, b=b, mask_x=mask_x, mask_y=mask_y)
         return (plan.barycentric(values) if self.normalize else plan @ values), plan

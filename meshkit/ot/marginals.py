@@ -18,7 +18,7 @@ class Sides(NamedTuple):
     nu: Tensor
     index_x: Tensor | None
     index_y: Tensor | None
-    log_smallest: float
+    weight_range: float
 
     def rows_of(self, values: Tensor) -> Tensor:
         """The rows ``(n, ...)`` that take part, of all ``(N, ...)``."""
@@ -33,25 +33,26 @@ class Sides(NamedTuple):
         return self._replace(mu=self.mu.detach(), nu=self.nu.detach())
 
 
-def pick(mu: Tensor | None, nu: Tensor | None, sample: int, rows: int, columns: int, like: Tensor) -> Sides:
+def pick(mu: Tensor | None, nu: Tensor | None, sample: int, sizes: tuple[int, int], like: Tensor) -> Sides:
     """Weights of one sample and where they are positive. Without mass on either side nothing is left of both."""
-    dtype = torch.promote_types(like.dtype, torch.float32)
     sides: list[tuple[Tensor, Tensor | None]] = []
-    spreads = 0.0
-    for weight, size in ((mu, rows), (nu, columns)):
+    weight_range = 0.0
+    for weight, size in zip((mu, nu), sizes, strict=True):
         if weight is None:
-            sides.append((like.new_full((size,), 1 / size, dtype=dtype), None))
-            spreads += math.log(size)
+            sides.append((like.new_full((size,), 1 / size), None))
+            weight_range += math.log(size)
         else:
             index = (weight[sample].detach() > 0).nonzero()[:, 0]
             chosen = weight[sample].index_select(0, index)
-            spreads -= math.log(max(float(chosen.detach().amin()), 1e-300)) if len(chosen) else 0.0
+            if len(chosen):
+                share = float(chosen.detach().amin() / chosen.detach().sum())
+                weight_range -= math.log(max(share, 1e-300))
             sides.append((chosen, index))
     if any(len(weight) == 0 for weight, _ in sides):
         nothing = torch.empty(0, dtype=torch.int64, device=like.device)
         sides = [(weight[:0], nothing) for weight, _ in sides]
     (mu_s, index_x), (nu_s, index_y) = sides
-    return Sides(mu_s, nu_s, index_x, index_y, spreads)
+    return Sides(mu_s, nu_s, index_x, index_y, weight_range)
 
 
 def weights(given: Tensor | None, mask: Tensor | None, like: Tensor, dtype: torch.dtype, side: str) -> Tensor | None:

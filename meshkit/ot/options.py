@@ -46,7 +46,7 @@ class Options(NamedTuple):
             return "log"
         if self.domain != "auto":
             return self.domain
-        return "kernel" if spread <= math.log(torch.finfo(sides.mu.dtype).max) - sides.log_smallest else "log"
+        return "kernel" if spread <= math.log(torch.finfo(sides.mu.dtype).max) - sides.weight_range else "log"
 
 
 def read_options(
@@ -55,14 +55,17 @@ def read_options(
     """Check the options."""
     for name, given, choices in (("grad", grad, Grad), ("domain", domain, Domain), ("store", store, Store)):
         check_choice(name, given, choices)
-    if n_iters < 1:
-        raise ValueError(f"n_iters must be at least 1, got {n_iters}")
+    if not isinstance(n_iters, int) or n_iters < 1:
+        raise ValueError(f"n_iters must be an integer of at least 1, got {n_iters}")
     if tol is not None and not tol >= 0:
         raise ValueError(f"tol must be None or at least 0, got {tol}")
     scales: tuple[float, ...] = ()
+    if isinstance(eps, str) or not isinstance(eps, int | float | Tensor | Sequence):
+        raise ValueError(f"eps must be a number, a scalar tensor or a sequence of numbers, got {type(eps).__name__}")
     if isinstance(eps, Sequence):
-        if not 1 <= len(eps) <= n_iters:
-            raise ValueError(f"eps has {len(eps)} values for n_iters = {n_iters}; give 1 to n_iters of them")
+        if len(eps) == 0:
+            raise ValueError("a sequence of eps needs at least one value")
+        n_iters = max(n_iters, len(eps))
         if any(isinstance(e, Tensor) for e in eps):
             raise ValueError("a sequence of eps must hold numbers: it receives no gradient")
         if domain == "kernel":
@@ -78,7 +81,10 @@ def read_options(
     if not 0 < value < math.inf:
         raise ValueError(f"eps must be positive and finite, got {value:g}")
     powers = []
-    for side in reach if isinstance(reach, tuple) else (reach, reach):
+    sides = tuple(reach) if isinstance(reach, Sequence) else (reach, reach)
+    if len(sides) != 2 or not all(side is None or isinstance(side, int | float) for side in sides):
+        raise ValueError(f"reach must be None, a number, or a pair of these for rows and columns, got {reach!r}")
+    for side in sides:
         if side is not None and not side > 0:
             raise ValueError(f"reach must be positive, or None for an exact marginal, got {reach}")
         powers.append(1.0 if side is None or side == math.inf else side / (side + value))

@@ -18,8 +18,8 @@ class TransportPlan:
 
     Rows belong to the source (the identity mesh), columns to the target (the pose mesh). Padded rows and columns, and
     those of zero weight, carry no mass. Every reading is one sweep over blocks of the kernel, :math:`O(N + M)` memory,
-    except :meth:`dense` and :meth:`assign`. Readings are differentiable, except indices; the gradients of several
-    readings of one plan are gathered into a single sweep.
+    except :meth:`dense` and :meth:`assign`; :meth:`topk` gathers N k features. Readings are differentiable, except
+    indices; the gradients of several readings of one plan are gathered into a single sweep.
 
     Plans come from :func:`~meshkit.ot.sinkhorn` and :func:`~meshkit.ot.sinkhorn_from_cost`.
 
@@ -42,6 +42,11 @@ class TransportPlan:
         """``(B, N, M)``."""
         batch, rows, columns = self._shape
         return torch.Size((batch, columns, rows) if self._transposed else self._shape)
+
+    def __repr__(self) -> str:
+        """Shape, type and regularisation."""
+        eps = float(torch.as_tensor(self._samples[0].eps).detach())
+        return f"TransportPlan(shape={tuple(self.shape)}, dtype={self.dtype}, eps={eps:g}, n_iters={self.n_iters})"
 
     @property
     def dtype(self) -> torch.dtype:
@@ -145,17 +150,18 @@ class TransportPlan:
             without mass, and beyond the number of real columns.
         """
         local, index = self._heaviest(k, dim)
-        over_rows = (dim == 2) != self._transposed
-        masses = [s.masses(near, over_rows) for s, near in zip(self._samples, local, strict=True)]
+        over_rows = (dim in (2, -1)) != self._transposed
+        with torch.autocast(self.device.type, enabled=False):
+            masses = [s.masses(near, over_rows) for s, near in zip(self._samples, local, strict=True)]
         return self._spread([pad_columns(mass, k) for mass in masses], over_rows=over_rows), index
 
     def _heaviest(self, k: int, dim: int) -> tuple[list[Tensor], Tensor]:
         """Positions among the rows (columns) that have weight, and in the padded batch."""
-        if dim not in (1, 2):
+        if dim not in (1, 2, -1, -2):
             raise ValueError(f"dim must be 1 (best rows of each column) or 2 (best columns of each row), got {dim}")
         if not 1 <= k <= self.shape[dim]:
             raise ValueError(f"k must be between 1 and {self.shape[dim]}, the number of candidates, got {k}")
-        over_rows = (dim == 2) != self._transposed
+        over_rows = (dim in (2, -1)) != self._transposed
         local = [sample.heaviest(k, over_rows) for sample in self._samples]
         index = []
         for sample, near in zip(self._samples, local, strict=True):
@@ -185,8 +191,9 @@ class TransportPlan:
         from scipy.optimize import linear_sum_assignment
 
         def solve(sample: SamplePlan) -> Tensor:
-            scores = sample.log_dense().detach()
-            scores = (scores.mT if self._transposed else scores).nan_to_num(neginf=-1e300).double().cpu()
+            with torch.no_grad():
+                scores = sample.log_dense().double().nan_to_num(neginf=-1e300).cpu()
+            scores = scores.mT if self._transposed else scores
             row, column = linear_sum_assignment(scores.numpy(), maximize=True)
             matched = torch.full((len(scores),), -1)
             matched[torch.from_numpy(row)] = torch.from_numpy(column)

@@ -135,7 +135,7 @@ class SamplePlan:
 
     def heaviest(self, k: int, over_rows: bool) -> Tensor:
         """Positions of the heaviest entries of each row (or column), ``(N, k)`` or fewer."""
-        with torch.no_grad():
+        with torch.no_grad(), torch.autocast(self.mu.device.type, enabled=False):
             tiles, scale = self.kernel.tiles, self.logarithms()[1] * LOG2_E
             if not over_rows:
                 tiles, scale = tiles.transposed(), self.logarithms()[0] * LOG2_E
@@ -149,7 +149,11 @@ class SamplePlan:
         own = torch.arange(len(near), device=near.device)[:, None].expand_as(near)
         i, j = (own, near) if over_rows else (near, own)
         x, *rest = self.kernel.inputs
-        logits = (x[i] * rest[0][j]).sum(2) if rest else x[i, j]
+        if not rest:
+            logits = x[i, j]
+        else:
+            own_side, other_side = (x, rest[0]) if over_rows else (rest[0], x)
+            logits = (own_side[:, None] * other_side[near]).sum(2)
         log_a, log_b = self.logarithms()
         return (logits / LOG2_E + log_a[i] + log_b[j]).exp()
 

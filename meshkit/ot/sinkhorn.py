@@ -56,10 +56,11 @@ def sinkhorn(
             offset, such as raw signatures, all look alike; standardise them first.
         eps: entropic regularisation, in units of the cost (the cosine cost lies in [0, 2]). A scalar tensor receives
             a gradient. A sequence is annealed: one value per iteration, the last one kept, as from
-            :func:`eps_schedule`.
-        n_iters: number of iterations, the largest number if ``tol`` is given.
-        tol: stop a sample once its column sums are this close to :math:`\nu`, as a sum of absolute differences; with
-            ``reach``, once :math:`b` changes by so little, weighted by :math:`\nu`.
+            :func:`eps_schedule`. What is small depends on the features: with ``"sqeuclidean"`` and ``"dot"``, scale eps
+            with the squares of their lengths.
+        n_iters: number of iterations, the largest number if ``tol`` is given; at least the length of a sequence of eps.
+        tol: stop a sample once its column sums are this close to :math:`\nu`, as a sum of absolute differences over the
+            total; with ``reach``, once :math:`b` changes by so little, weighted by :math:`\nu`.
         a: ``(B, N)`` or ``(N,)`` row weights :math:`\mu`, uniform with sum 1 by default. Rows of weight 0 are left out.
         b: ``(B, M)`` or ``(M,)`` column weights :math:`\nu`.
         mask_x: ``(B, N)`` bool, True = real vertex. Masked rows are left out, whatever they hold.
@@ -72,9 +73,12 @@ def sinkhorn(
             plan is a constant.
         domain: ``"kernel"`` iterates on :math:`K` (fast), ``"log"`` on its logarithm (safe at any ``eps``), ``"auto"``
             takes the kernel where the range of the dtype allows: for uniform weights and the cosine cost
-            ``eps >= 2 / (log(max) - log(N M))``, .0282 for 6890 x 6890 in float32.
+            ``eps >= 2 / (log(max) - log(N M))``, .0282 for 6890 x 6890 in float32. A plan forced into the kernel domain
+            below that may be NaN. Triton kernels, which run float32 features on GPUs, always work in the log domain.
         store: ``"keep"`` holds K for all later sweeps and the backward pass, N x M numbers per sample; ``"stream"``
-            computes it again, in :math:`O((N + M) D)` memory; ``"auto"`` keeps up to 1 GiB.
+            computes it again, in :math:`O((N + M) D)` memory; ``"auto"`` keeps up to 1 GiB. A kept K lives as long as
+            the plan or the graph of its readings. Triton kernels always stream; the environment variable
+            ``MESHKIT_TRITON=0`` switches them off.
         check_finite: raise an error if a real vertex has a feature that is not finite.
 
     Returns:
@@ -112,7 +116,7 @@ def sinkhorn(
         keep = options.keep(batch * rows * columns * dtype.itemsize)
         samples = []
         for s in range(batch):
-            sides = pick(mu, nu, s, rows, columns, fx)
+            sides = pick(mu, nu, s, (rows, columns), fx.new_empty(0, dtype=dtype))
             x, y = sides.rows_of(fx[s].to(dtype)), sides.columns_of(fy[s].to(dtype))
             if check_finite and not bool(x.isfinite().all() & y.isfinite().all()):
                 raise ValueError(f"sample {s} has features that are not finite; mask those vertices or mend them")
@@ -186,8 +190,8 @@ def solve_cost(
     start: Tensor | None = None,
 ) -> TransportPlan:
     """:func:`sinkhorn_from_cost` with options read already; ``start (B, N)`` is the log of the first row scaling."""
-    if cost.dim() != 3 or cost.shape[1] == 0 or cost.shape[2] == 0:
-        raise ValueError(f"cost must be (B, N, M) with at least one row and column, got {tuple(cost.shape)}")
+    if cost.dim() != 3 or 0 in cost.shape:
+        raise ValueError(f"cost must be (B, N, M) with at least one sample, row and column, got {tuple(cost.shape)}")
     batch, rows, columns = cost.shape
     dtype = torch.promote_types(cost.dtype, torch.float32)
     with torch.autocast(cost.device.type, enabled=False):
@@ -197,7 +201,7 @@ def solve_cost(
         keep = options.keep(batch * rows * columns * dtype.itemsize)
         samples = []
         for s in range(batch):
-            sides = pick(mu, nu, s, rows, columns, cost)
+            sides = pick(mu, nu, s, (rows, columns), cost.new_empty(0, dtype=dtype))
             matrix = sides.columns_of(sides.rows_of(cost[s].to(dtype)).mT).mT
             if options.settings.grad == "none":
                 matrix, sides = matrix.detach(), sides.detached()
@@ -248,6 +252,9 @@ def eps_schedule(start: float, final: float, *, factor: float = 0.5) -> list[flo
     Example:
         >>> eps_schedule(1.0, 0.2)
         [1.0, 0.5, 0.25, 0.2]
+        >>> features = torch.eye(3)[None]
+        >>> sinkhorn(features, features, eps=eps_schedule(1.0, 0.01), n_iters=100, tol=1e-4).n_iters
+        [9]
     """
     if not (float("inf") > start >= final > 0 and 0 < factor < 1):
         raise ValueError(f"need finite start >= final > 0 and 0 < factor < 1, got {start}, {final} and {factor}")
@@ -283,6 +290,10 @@ def solve(
 
 def check_features(fx: Tensor, fy: Tensor) -> None:
     """Shapes of two batches of features."""
+    for features in (fx, fy):
+        if not isinstance(features, Tensor) or not features.is_floating_point():
+            kind = features.dtype if isinstance(features, Tensor) else type(features).__name__
+            raise ValueError(f"features must be floating-point tensors, got {kind}; convert with torch.as_tensor")
     if fx.dim() != 3 or fy.dim() != 3 or fx.shape[0] != fy.shape[0] or fx.shape[2] != fy.shape[2]:
         hint = "; add a batch dimension with [None]" if fx.dim() == fy.dim() == 2 else ""
         raise ValueError(f"features must be (B, N, D) and (B, M, D), got {tuple(fx.shape)} and {tuple(fy.shape)}{hint}")

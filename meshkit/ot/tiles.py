@@ -259,7 +259,7 @@ def grouped(factors: Sequence[Factors]) -> list[Factors]:
             if base is None or reference is None:
                 continue
             shift_a, shift_b = reference.alpha - base.alpha, reference.beta - base.beta
-            if base.scale == reference.scale and max(_reach(shift_a), _reach(shift_b)) < _RANGE:
+            if base.scale == reference.scale and _within(shift_a, shift_b):
                 left, right = left * shift_a.exp2()[:, None], right * shift_b.exp2()[:, None]
                 break
         else:
@@ -270,8 +270,8 @@ def grouped(factors: Sequence[Factors]) -> list[Factors]:
     return [Factors(torch.cat(lefts, 1), torch.cat(rights, 1), base) for base, lefts, rights in groups]
 
 
-def _reach(shift: Tensor) -> float:
-    return float(shift.abs().amax().nan_to_num(math.inf))
+def _within(*shifts: Tensor) -> bool:
+    return bool((torch.stack([shift.abs().amax() for shift in shifts]) < _RANGE).all())
 
 
 def log2_sum(values: Tensor, dim: int) -> Tensor:
