@@ -108,7 +108,7 @@ def layer(size: int, width: int, peak: float) -> None:
         print(f"{size:6} {name:<30} {forward}   with backward {measure(partial(both, step))}")
     rank = 2 * N_ITERS - 1 + CHANNELS + 1
     sweeps = (2 * N_ITERS + 1) * width + CHANNELS + 1  # half steps and the warp
-    backward = 2 * N_ITERS * (width + 1) + CHANNELS + 2 * (2 * width + rank)
+    backward = (2 * N_ITERS - 1) * (width + 1) + CHANNELS + 2 * (2 * width + rank)
     bounds = [2e3 * size * size * m / (peak * 1e12) for m in (sweeps, sweeps + backward)]
     print(f"{size:6} {'roofline of Triton':<30} {bounds[0]:9.2f} ms {'':10}   with backward {bounds[1]:9.2f} ms")
 

@@ -19,10 +19,20 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 from update_public_api import public_modules
 
-from meshkit.consistency import DualReconstruction
+from meshkit.consistency import CycleReconstruction, DualReconstruction, GeneratorAdapter, SelfReconstruction
 from meshkit.data import RiggedModel
 from meshkit.deform import ARAPDeformer
-from meshkit.losses import BackwardCorrespondenceLoss, EdgeLengthLoss, EdgeRatioLoss, ReconstructionLoss
+from meshkit.losses import (
+    ARAPEnergyLoss,
+    BackwardCorrespondenceLoss,
+    ChamferLoss,
+    EdgeLengthLoss,
+    EdgeRatioLoss,
+    LaplacianLoss,
+    NormalConsistencyLoss,
+    ReconstructionLoss,
+    SinkhornDivergenceLoss,
+)
 from meshkit.models import NPT, OrderedPoseTransferStack, PointwiseExtractor, PoseTransferGenerator, PoseTransferStack
 from meshkit.neighbors import knn
 from meshkit.nn import ConditionalResBlock, SetConv, SetConvExtractor
@@ -219,6 +229,54 @@ ENTRIES |= {
         {"a": ["identity_mask"], "b": ["mask"]},
         prepare=with_plan,
         out=None,
+    ),
+}
+SURFACE = {"masks": {"a": ["mask"]}, "index": {"faces": ("a", strip)}, "out": None, "compile": "breaks"}
+POINTS = {
+    "rows": {"pred": ("a", 3), "target": ("b", 3)},
+    "masks": {"a": ["mask"], "b": ["target_mask"]},
+    "out": None,
+}
+ENTRIES |= {
+    "LaplacianLoss": Entry(LaplacianLoss, {"verts": ("a", 3), "reference": ("a", 3)}, **SURFACE),
+    "LaplacianLoss-cotangent": Entry(lambda: LaplacianLoss(weights="cotangent"), {"verts": ("a", 3)}, **SURFACE),
+    "NormalConsistencyLoss": Entry(NormalConsistencyLoss, {"verts": ("a", 3)}, **SURFACE),
+    "ChamferLoss": Entry(ChamferLoss, **POINTS, compile="breaks"),
+    "SinkhornDivergenceLoss": Entry(
+        lambda: SinkhornDivergenceLoss(eps=0.3, n_iters=20, tol=None, anneal=None),
+        **POINTS,
+        compile=None,  # as SinkhornCorrespondence
+    ),
+    "ARAPEnergyLoss": Entry(
+        ARAPEnergyLoss,
+        {"verts": ("a", 3), "reference": ("a", 3)},
+        **SURFACE | {"compile": None},  # as ARAPDeformer
+        constants=["reference"],
+        default_device=False,
+    ),
+    "CycleReconstruction": Entry(
+        lambda: CycleReconstruction(PoseTransferGenerator(**SMALL, residual=True)),
+        **PAIR,
+        result=lambda o: o.reconstruction_a,
+        compile=None,  # as DualReconstruction
+        bf16=0.2,
+    ),
+    "SelfReconstruction": Entry(
+        lambda: SelfReconstruction(PoseTransferGenerator(**SMALL, residual=True)),
+        {"verts": ("a", 3)},
+        {"a": ["mask"]},
+        result=lambda o: o.reconstruction,
+        compile=None,  # as its generator
+    ),
+    "GeneratorAdapter": Entry(
+        lambda: GeneratorAdapter(
+            PoseTransferGenerator(**SMALL, residual=True),
+            keywords={name: name for name in ("identity_mask", "pose_mask")},
+            vertices="vertices",
+        ),
+        **PAIR,
+        result=lambda o: o.vertices,
+        compile=None,  # as its generator
     ),
 }
 DTYPE = torch.float64

@@ -1,5 +1,7 @@
 """Dual reconstruction around toy generators whose results are written out, and around the real one."""
 
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -7,7 +9,15 @@ import torch
 from conftest import GARBAGE, assert_near, rand, scatter, scattered_mask
 from torch import Tensor, nn
 
-from meshkit.consistency import DualOutput, DualReconstruction
+from meshkit.consistency import (
+    CycleOutput,
+    CycleReconstruction,
+    DualOutput,
+    DualReconstruction,
+    GeneratorAdapter,
+    SelfOutput,
+    SelfReconstruction,
+)
 from meshkit.deform import ARAPDeformer
 from meshkit.models import PoseTransferGenerator
 
@@ -190,6 +200,169 @@ def test_gradient_of_the_generator(generator, deform, stop_gradient):
     assert result.output.requires_grad
 
 
+@pytest.mark.parametrize("deform", [None, Shift()])
+def test_released_policy_stops_the_gradient_only_where_the_deformer_ran(deform):
+    def gradients(stop_gradient: str) -> list[Tensor]:
+        net = Encoding(1.5)
+        result = DualReconstruction(net, deform, stop_gradient=stop_gradient)(A, B, identity_faces=TETRAHEDRON)
+        values = (result.output, result.reconstruction_a, result.reconstruction_b)
+        return [torch.autograd.grad(v.square().sum(), net.theta, retain_graph=True)[0] for v in values]
+
+    same, other = ("none", "deformed") if deform is None else ("deformed", "none")
+    assert gradients("released") == gradients(same) != gradients(other)
+
+
+def test_a_deformer_without_gradient_is_run_without_gradient():
+    modes = []
+
+    def deform(rest: Tensor, target: Tensor, faces: Tensor, *, mask: Tensor | None) -> Tensor:
+        modes.append(torch.is_grad_enabled())
+        return rest + target
+
+    for policy in ("none", "deformed", "released"):
+        DualReconstruction(Affine(), deform, stop_gradient=policy)(A, B, identity_faces=TETRAHEDRON)
+    with torch.no_grad():
+        DualReconstruction(Affine(), deform)(A, B, identity_faces=TETRAHEDRON)
+    assert modes == [True, False, False, False]
+
+
+# Cycle and self reconstruction
+
+
+@pytest.mark.parametrize("generator", [Affine, Encoding])
+def test_cycle_closed_form(generator):
+    """AB = 2A + mB; BA = 2B + mA; A' = 2 AB + mBA; B' = 2 BA + mAB; A'' = 2A + mA."""
+    result = CycleReconstruction(generator())(A, B)
+    ab, ba = 2 * A + mean(B), 2 * B + mean(A)
+    assert isinstance(result, CycleOutput)
+    expected = {
+        "output": ab,
+        "output_b": ba,
+        "reconstruction_a": 2 * ab + mean(ba),
+        "reconstruction_b": 2 * ba + mean(ab),
+    }
+    for name, value in (expected | {"self_reconstruction": 2 * A + mean(A)}).items():
+        assert_near(getattr(result, name), value, 1e-14)
+    assert result.target_a is A and result.target_b is B and result.mask_a is None and result.mask_b is None
+    if generator is Encoding:
+        assert_near(result.warped, ab + 1, 1e-14)
+        assert torch.equal(result.plan[1], B)
+    else:
+        assert result.warped is None and result.plan is None
+
+
+def test_cycle_passes_and_encodings():
+    generator = Encoding()
+    id_mask, pose_mask = scattered_mask([5, 7], 7), scattered_mask([9, 2], 9)
+    id_d, pose_d = rand(2, 7, 4).requires_grad_(), rand(2, 9, 4).requires_grad_()
+    masks = {"identity_mask": id_mask, "pose_mask": pose_mask}
+    result = CycleReconstruction(generator)(A, B, **masks, identity_descriptors=id_d, pose_descriptors=pose_d)
+    meshes = {"a": (A, id_mask, id_d, True), "b": (B, pose_mask, pose_d, True)}
+    meshes |= {"ab": (result.output, id_mask, id_d, False), "ba": (result.output_b, pose_mask, pose_d, False)}
+    assert len(generator.encoded) == 4
+    for call, (verts, mask, descriptors, passes_gradient) in zip(generator.encoded, meshes.values(), strict=True):
+        assert torch.equal(call.verts, verts) and call.mask is mask and torch.equal(call.descriptors, descriptors)
+        assert call.descriptors.requires_grad == passes_gradient
+    order = [("a", "b"), ("b", "a"), ("ab", "ba"), ("ba", "ab"), ("a", "a")]
+    assert len(generator.calls) == 5
+    for call, names in zip(generator.calls, order, strict=True):
+        for side, verts, name in zip(("identity", "pose"), (call.identity, call.pose), names, strict=True):
+            assert torch.equal(verts, meshes[name][0])
+            assert torch.equal(call.options[f"{side}_features"], 10 * verts)
+            assert call.options[f"{side}_mask"] is meshes[name][1]
+            assert torch.equal(call.options[f"{side}_descriptors"], meshes[name][2])
+    assert result.mask_a is id_mask and result.mask_b is pose_mask
+
+
+@pytest.mark.parametrize("stop_gradient", ["none", "generated"])
+def test_cycle_gradient(stop_gradient):
+    """d/dtheta of A' = theta AB + mBA with AB = theta A + mB, BA = theta B + mA, constants or not."""
+    net = Encoding(1.5)
+    result = CycleReconstruction(net, stop_gradient=stop_gradient)(A, B)
+    through = 1.0 if stop_gradient == "none" else 0.0
+    for value, expected in [
+        (result.output, A),
+        (result.output_b, B),
+        (result.reconstruction_a, result.output + through * (1.5 * A + mean(B))),
+        (result.reconstruction_b, result.output_b + through * (1.5 * B + mean(A))),
+        (result.self_reconstruction, A),
+    ]:
+        upstream = rand(*value.shape, seed=5)
+        (gradient,) = torch.autograd.grad(value, net.theta, upstream, retain_graph=True)
+        assert gradient.item() == pytest.approx((expected * upstream).sum().item(), rel=1e-12)
+
+
+def test_self_reconstruction():
+    generator, mask, descriptors = Encoding(), scattered_mask([5, 7], 7), rand(2, 7, 4)
+    result = SelfReconstruction(generator)(A, mask=mask, descriptors=descriptors)
+    assert isinstance(result, SelfOutput)
+    assert_near(result.reconstruction, 2 * A + mean(A), 1e-14)
+    assert result.target is A and result.mask is mask and torch.equal(result.plan[1], A)
+    assert_near(result.warped, result.reconstruction + 1, 1e-14)
+    assert len(generator.encoded) == len(generator.calls) == 1
+    options = generator.calls[0].options
+    assert options["identity_mask"] is options["pose_mask"] is mask
+    assert options["identity_descriptors"] is options["pose_descriptors"] is descriptors
+    plain = SelfReconstruction(Affine())(A)
+    assert plain.warped is None and plain.plan is None
+
+
+# Other generators
+
+
+class Foreign(nn.Module):
+    """Takes (source, template) as (B, 3, N), knows its own names, returns a dictionary and an extra loss."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.theta = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
+
+    def forward(self, source: Tensor, template: Tensor, *, valid: Tensor | None = None) -> tuple[dict, Tensor]:
+        weight = source.new_ones(len(source), source.shape[2]) if valid is None else valid.to(source.dtype)
+        pose = (source * weight[:, None]).sum(2, keepdim=True) / weight.sum(1)[:, None, None]
+        mesh = self.theta * template + pose
+        return {"mesh": mesh, "warp": mesh + 1, "match": "plan"}, self.theta.square()
+
+
+NAMES = {"identity": "template", "pose": "source", "pose_mask": "valid"}
+
+
+def adapted() -> GeneratorAdapter:
+    options = {f: (lambda r, k=k: r[0][k]) for f, k in (("vertices", "mesh"), ("warped", "warp"), ("plan", "match"))}
+    return GeneratorAdapter(Foreign(), keywords=NAMES, channels_first=True, **options)
+
+
+@pytest.mark.parametrize("wrapper", [DualReconstruction, CycleReconstruction])
+def test_an_adapted_generator_equals_the_plain_one(wrapper):
+    mask = scattered_mask([9, 4], 9)
+    pose = torch.stack([b[m].mean(0) for b, m in zip(B, mask, strict=True)])[:, None]
+    system = wrapper(adapted())
+    result = system(A, B, pose_mask=mask)
+    assert_near(result.output, 2 * A + pose, 1e-14)
+    assert_near(result.warped, result.output + 1, 1e-14)
+    assert result.plan == "plan"
+    assert_near(wrapper(adapted())(A, B).reconstruction_a, wrapper(Affine())(A, B).reconstruction_a, 1e-14)
+    result.reconstruction_b.square().sum().backward()
+    assert system.generator.generator.theta.grad is not None
+
+
+def test_adapter_reads_attributes_keys_indices_and_bare_tensors():
+    tensor = A + 1
+    for returned, where in [
+        (tensor, None),
+        ({"mesh": tensor}, "mesh"),
+        (SimpleNamespace(mesh=tensor), "mesh"),
+        ((0, tensor), 1),
+        ([[tensor]], lambda r: r[0][0]),
+    ]:
+        result = GeneratorAdapter(lambda i, p, r=returned: r, vertices=where)(A, B)
+        assert result.vertices is tensor and result.warped is None and result.plan is None
+    # Masks go only to models that name them.
+    assert GeneratorAdapter(lambda i, p: i)(A, B, identity_mask=scattered_mask([5, 7], 7)).vertices is A
+    # A mesh that is named is not passed by position as well.
+    assert GeneratorAdapter(lambda p, *, shape: shape, keywords={"identity": "shape"})(A, B).vertices is A
+
+
 # Subsets of vertices
 
 
@@ -312,12 +485,29 @@ def test_training_step_with_the_arap_deformer(points, options):
     assert set(dual.state_dict()) == {f"generator.{name}" for name in net.state_dict()}
 
 
+def test_documented_blocks_run():
+    blocks = re.findall(
+        r"```python\n(.*?)```", (Path(__file__).parents[1] / "docs" / "consistency.md").read_text(), re.S
+    )
+    assert blocks
+    for block in blocks:
+        exec(compile(block, "docs/consistency.md", "exec"), {})
+
+
 # Errors
 
 
 def test_errors():
-    with pytest.raises(ValueError, match='stop_gradient must be "none" or "deformed", got \'all\''):
-        DualReconstruction(Affine(), stop_gradient="all")
+    for wrapper in (DualReconstruction, CycleReconstruction):
+        with pytest.raises(ValueError, match=r"stop_gradient must be one of \('none', .*\), got 'all'"):
+            wrapper(Affine(), stop_gradient="all")
+    with pytest.raises(ValueError, match=r"keywords may name .*, got \['target'\]"):
+        GeneratorAdapter(Affine(), keywords={"target": "x"})
+    for wrong in ((A[0], B), (A, B[0])):
+        with pytest.raises(ValueError, match=r"must have shape \(B, N, 3\)"):
+            CycleReconstruction(Affine())(*wrong)
+    with pytest.raises(ValueError, match=r"must have shape \(B, N, 3\)"):
+        SelfReconstruction(Affine())(A[0])
     with pytest.raises(ValueError, match="points needs a generator with an encode method"):
         DualReconstruction(Affine(), points=4)
     with pytest.raises(ValueError, match="the deformer needs identity_faces"):

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from torch.autograd import gradcheck
+from torch.autograd import gradcheck, gradgradcheck
 
 from meshkit.batching import pad, pad_faces
 from meshkit.losses import (
@@ -17,6 +17,7 @@ from meshkit.losses import (
     edge_ratio_loss,
     reconstruction_loss,
 )
+from meshkit.ot import sinkhorn
 
 GARBAGE = [1e20, float("nan")]
 TETRAHEDRON = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
@@ -422,6 +423,60 @@ def test_backward_runs_in_full_precision_under_autocast():
             lifted = backward_correspondence_loss(plan.bfloat16(), pose.float(), form=form)
         torch.testing.assert_close(value, expected, rtol=1e-5, atol=0)
         assert lifted.dtype == torch.float32
+
+
+@normalizations
+@reductions
+@pytest.mark.parametrize("shape", [(7, 4), (4, 7), (5, 5)])
+def test_matrix_form_in_blocks_equals_the_whole_gram_matrix(shape, normalization, reduction, monkeypatch):
+    """Tall, wide and square plans; stored, with a gradient, and read by products; blocks that do not divide it."""
+    rows, columns = shape
+    a, kernel, b = rand(2, rows, seed=1).exp(), rand(2, rows, columns, seed=2).exp(), rand(2, columns, seed=3).exp()
+    mask = torch.arange(columns) < torch.tensor([[columns], [columns - 1]])
+    identity_mask = torch.arange(rows) < torch.tensor([[rows - 2], [rows]])
+    a, b = a * identity_mask, b * mask
+    dense = (a[..., None] * kernel * b[:, None]).requires_grad_()
+    sums = dense.sum(2, keepdim=True)
+    used = dense / torch.where(sums > 0, sums, 1) if normalization == "rows" else dense
+    squares = (used.mT @ used - torch.diag_embed(mask.double())).square().sum((1, 2))
+    expected = {"sum": squares.mean(), "none": squares / mask.sum(1) ** 2, "mean": (squares / mask.sum(1) ** 2).mean()}
+    (gradient,) = torch.autograd.grad(expected[reduction].sum(), dense)
+    pose = torch.zeros(2, columns, 3, dtype=torch.float64)
+    options = {"form": "matrix", "normalization": normalization, "reduction": reduction}
+    options |= {"mask": mask, "identity_mask": identity_mask}
+    real = identity_mask[:, :, None] & mask[:, None]
+    for block in (3, 512):
+        monkeypatch.setattr("meshkit.losses.backward_correspondence._BLOCK", block)
+        value = backward_correspondence_loss(dense, pose, **options)
+        torch.testing.assert_close(value, expected[reduction], rtol=1e-12, atol=1e-12)
+        (own,) = torch.autograd.grad(value.sum(), dense)
+        torch.testing.assert_close(own[real], gradient[real], rtol=1e-11, atol=1e-11)
+        for given in (Factored(a, kernel, b), Factored(a.clone().requires_grad_(), kernel, b)):
+            value = backward_correspondence_loss(given, pose, **options)
+            torch.testing.assert_close(value, expected[reduction], rtol=1e-12, atol=1e-12)
+
+
+def test_matrix_form_of_a_sinkhorn_plan_has_the_gradient_of_the_stored_plan():
+    x, y = rand(1, 6, 4).requires_grad_(), rand(1, 9, 4, seed=1).requires_grad_()
+    pose = torch.zeros(1, 9, 3, dtype=torch.float64)
+    plan = sinkhorn(x, y, eps=0.3)
+    T = plan.dense()
+    T = T / T.sum(2, keepdim=True)
+    expected = (T.mT @ T - torch.eye(9)).square().mean()
+    value = backward_correspondence_loss(plan, pose, form="matrix")
+    torch.testing.assert_close(value, expected)
+    for own, wanted in zip(
+        *(torch.autograd.grad(v, [x, y], retain_graph=True) for v in (value, expected)), strict=True
+    ):
+        torch.testing.assert_close(own, wanted)
+    with torch.no_grad():
+        torch.testing.assert_close(backward_correspondence_loss(plan, pose, form="matrix"), expected.detach())
+
+
+def test_second_derivative_of_the_matrix_form():
+    leaf = rand(1, 4, 3).exp().requires_grad_()
+    pose = torch.zeros(1, 3, 3, dtype=torch.float64)
+    assert gradgradcheck(lambda t: backward_correspondence_loss(t, pose, form="matrix"), leaf)
 
 
 # Modules and errors

@@ -114,6 +114,21 @@ def test_chamfer_by_hand():
     assert chamfer_distance(p, q, direction="backward", point_reduction="sum").item() == 25 + 144
 
 
+@pytest.mark.parametrize("squared", [True, False])
+def test_chamfer_distances_of_the_points(ragged, squared):
+    pred, pred_mask, target, target_mask, preds, targets = ragged
+    masks = {"pred_mask": pred_mask, "target_mask": target_mask}
+    details = chamfer_distance(pred, target, squared=squared, return_distances=True, **masks)
+    assert torch.equal(details.value, chamfer_distance(pred, target, squared=squared, **masks))
+    for b, (p, t) in enumerate(zip(preds, targets, strict=True)):
+        there, back = cKDTree(t).query(p)[0], cKDTree(p).query(t)[0]
+        np.testing.assert_allclose(details.forward[b, : len(p)], there**2 if squared else there, rtol=1e-9)
+        np.testing.assert_allclose(details.backward[b, : len(t)], back**2 if squared else back, rtol=1e-9)
+    assert (details.forward[~pred_mask] == 0).all() and (details.backward[~target_mask] == 0).all()
+    one_sided = chamfer_distance(pred, target, squared=squared, direction="backward", return_distances=True, **masks)
+    assert one_sided.forward is None and torch.equal(one_sided.backward, details.backward)
+
+
 def test_chamfer_is_symmetric_and_ignores_order():
     p, q = rand(1, 30, 3), rand(1, 20, 3, seed=1)
     value = chamfer_distance(p, q)

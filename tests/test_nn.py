@@ -289,7 +289,7 @@ def test_extractor_under_autocast():
             {"k": 3, "descriptors": 2},
             5,
             None,
-            "takes 2 descriptor channels, got 0: compute them with .*intrinsic_descriptors",
+            "takes 2 descriptor channels, got 0: compute them with .*intrinsic",
         ),
         ({"k": 3, "descriptors": 2}, 5, (1, 5, 3), "takes 2 descriptor channels, got 3$"),
         ({"k": 3}, 5, (1, 5, 1), "takes 0 descriptor channels, got 1$"),

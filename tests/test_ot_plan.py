@@ -557,7 +557,7 @@ def test_values_of_another_shape(shape):
     ("k", "dim", "message"),
     [
         (1, 0, r"dim must be 1 .* or 2 .* got 0"),
-        (1, -1, "dim must be .* got -1"),
+        (1, -3, "dim must be .* got -3"),
         (0, 2, "k must be between 1 and 6, the number of candidates, got 0"),
         (7, 2, "k must be between 1 and 6, .* got 7"),
         (5, 1, "k must be between 1 and 4, .* got 5"),

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 
 from meshkit.batching import check_verts
-from meshkit.neighbors import gather_vertices
+from meshkit.consistency._passes import Mesh, check_stop_gradient, generate
 
 __all__ = ["DualOutput", "DualReconstruction"]
+
+StopGradient = Literal["none", "deformed", "released"]
 
 
 class DualOutput(NamedTuple):
@@ -60,13 +62,20 @@ class DualReconstruction(nn.Module):
         points: match this many random vertices of B in the main pass, and run the two auxiliary passes on as many
             vertices of each mesh. The output, the deformer and features see whole meshes. ``None``: all vertices.
             Needs a generator with ``encode``, and no masks.
-        stop_gradient: ``"none"``, or ``"deformed"``: the auxiliary passes take the deformed mesh as a constant.
+        stop_gradient: ``"none"``: all gradients. ``"deformed"``: the auxiliary passes take the mesh they start from as
+            a constant, whether it was deformed or not. ``"released"``: only where the deformer ran. Where the gradient
+            stops, the deformer runs without recording one.
+
+    Raises:
+        ValueError: an unknown policy, ``points`` below 1, or ``points`` without an encoder.
 
     Reference:
         X-DualNet, "Cross consistency and dual reconstruction" and "ARAP deformer".
 
     Deviations:
-        With a deformer, the released code computes it without gradient, which is ``stop_gradient="deformed"``.
+        The released code runs the deformer outside the graph, which is ``stop_gradient="released"``: in the first
+        epochs, without deformer, gradients pass through the output, later they do not. The default keeps them
+        throughout, as the objective is printed.
 
     Example:
         >>> generator = lambda identity, pose: identity * 0.5
@@ -81,11 +90,10 @@ class DualReconstruction(nn.Module):
         deform: Callable[..., Tensor] | None = None,
         *,
         points: int | None = None,
-        stop_gradient: str = "none",
+        stop_gradient: StopGradient = "none",
     ) -> None:
         super().__init__()
-        if stop_gradient not in ("none", "deformed"):
-            raise ValueError(f'stop_gradient must be "none" or "deformed", got {stop_gradient!r}')
+        check_stop_gradient(stop_gradient, get_args(StopGradient))
         if points is not None and points < 1:
             raise ValueError(f"points must be at least 1, or None for all vertices, got {points}")
         if points is not None and not hasattr(generator, "encode"):
@@ -125,26 +133,28 @@ class DualReconstruction(nn.Module):
         check_verts(pose, name="pose")
         if self.points is not None and (identity_mask is not None or pose_mask is not None):
             raise ValueError("points works on unpadded batches; leave it None for ragged ones")
-        a = _Mesh(identity, identity_mask, identity_descriptors).encoded(self.generator)
-        b = _Mesh(pose, pose_mask, pose_descriptors).encoded(self.generator)
+        a = Mesh(identity, identity_mask, identity_descriptors).encoded(self.generator)
+        b = Mesh(pose, pose_mask, pose_descriptors).encoded(self.generator)
         b = b.subset(self._choose(pose))
-        main = self._generate(a, b)
+        main = generate(self.generator, a, b)
         deformed = main.vertices
-        if self.deform is not None and use_deform:
+        deform = self.deform if use_deform else None
+        constant = self.stop_gradient == "deformed" or (self.stop_gradient == "released" and deform is not None)
+        if deform is not None:
             if identity_faces is None:
                 raise ValueError("the deformer needs identity_faces")
-            deformed = self.deform(identity, main.vertices, identity_faces, mask=identity_mask)
-        if self.stop_gradient == "deformed":
+            with torch.set_grad_enabled(torch.is_grad_enabled() and not constant):
+                deformed = deform(identity, deformed, identity_faces, mask=identity_mask)
+        if constant:
             deformed = deformed.detach()
-        constant = None if identity_descriptors is None else identity_descriptors.detach()
-        generated = _Mesh(deformed, identity_mask, constant).encoded(self.generator)
+        generated = a.moved(deformed).encoded(self.generator)
         chosen = self._choose(identity)
         a, generated = a.subset(chosen), generated.subset(chosen)
         return DualOutput(
             output=main.vertices,
             deformed=deformed,
-            reconstruction_a=self._generate(generated, a).vertices,
-            reconstruction_b=self._generate(b, generated).vertices,
+            reconstruction_a=generate(self.generator, generated, a).vertices,
+            reconstruction_b=generate(self.generator, b, generated).vertices,
             target_a=a.verts,
             target_b=b.verts,
             mask_a=a.mask,
@@ -153,45 +163,8 @@ class DualReconstruction(nn.Module):
             plan=getattr(main, "plan", None),
         )
 
-    def _generate(self, identity: _Mesh, pose: _Mesh) -> Any:
-        arguments = {"identity_mask": identity.mask, "pose_mask": pose.mask}
-        arguments |= {"identity_descriptors": identity.descriptors, "pose_descriptors": pose.descriptors}
-        if identity.features is not None:
-            arguments |= {"identity_features": identity.features, "pose_features": pose.features}
-        result = self.generator(identity.verts, pose.verts, **{k: v for k, v in arguments.items() if v is not None})
-        result = _Vertices(result) if isinstance(result, Tensor) else result
-        shape = getattr(getattr(result, "vertices", None), "shape", None)
-        if shape != identity.verts.shape:
-            raise ValueError(
-                "the generator must return vertices of the identity's shape, as a tensor or as an object with them as "
-                f".vertices: expected {tuple(identity.verts.shape)}, got {shape and tuple(shape)} in {type(result)}"
-            )
-        return result
-
     def _choose(self, verts: Tensor) -> Tensor | None:
         """Random vertices of each mesh, ``(B, points)``."""
         if self.points is None or self.points >= verts.shape[1]:
             return None
         return torch.rand(verts.shape[:2], device=verts.device).topk(self.points, dim=1).indices
-
-
-class _Vertices(NamedTuple):
-    vertices: Tensor
-
-
-class _Mesh(NamedTuple):
-    verts: Tensor
-    mask: Tensor | None
-    descriptors: Tensor | None
-    features: Tensor | None = None
-
-    def encoded(self, generator: Any) -> _Mesh:
-        if not hasattr(generator, "encode"):
-            return self
-        return self._replace(features=generator.encode(self.verts, mask=self.mask, descriptors=self.descriptors))
-
-    def subset(self, index: Tensor | None) -> _Mesh:
-        if index is None or self.features is None:
-            return self
-        descriptors = None if self.descriptors is None else gather_vertices(self.descriptors, index)
-        return _Mesh(gather_vertices(self.verts, index), None, descriptors, gather_vertices(self.features, index))

@@ -1,11 +1,9 @@
-"""What the losses share: one meaning of `reduction`, one precision, one check of the faces."""
+"""What the losses share: one meaning of `reduction`, one precision."""
 
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
-
-from meshkit.topology import check_faces
 
 Reduction = Literal["mean", "sum", "none"]
 
@@ -15,18 +13,22 @@ def check_reduction(reduction: str) -> None:
         raise ValueError(f"reduction must be one of {get_args(Reduction)}, got {reduction!r}")
 
 
-def check_faces_match(verts: Tensor, faces: Tensor) -> None:
-    check_faces(faces, verts.shape[1], batched=True)
-    if faces.ndim == 3 and faces.shape[0] != verts.shape[0]:
-        raise ValueError(
-            f"faces {tuple(faces.shape)} must have the batch size of verts {tuple(verts.shape)}; pass (F, 3) to share "
-            "one face list"
-        )
+def check_same_shape(first: Tensor, second: Tensor, names: str) -> None:
+    if first.shape != second.shape:
+        raise ValueError(f"{names} must have the same shape, got {tuple(first.shape)} and {tuple(second.shape)}")
 
 
 def at_least_float32(x: Tensor) -> Tensor:
     """Squares and sums of half precision coordinates over- and underflow; so losses are float32 or float64."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
+def safe_sqrt(squared: Tensor) -> Tensor:
+    """Square root with the subgradient 0 at 0; NaN stays NaN."""
+    if not squared.requires_grad:
+        return squared.sqrt()
+    zero = squared == 0
+    return torch.where(zero, 0, torch.where(zero, 1, squared).sqrt())
 
 
 def reduce_samples(total: Tensor, count: Tensor | int, reduction: Reduction) -> Tensor:
@@ -37,5 +39,5 @@ def reduce_samples(total: Tensor, count: Tensor | int, reduction: Reduction) -> 
     """
     if reduction == "sum":
         return total.mean()
-    mean = total / (count.clamp_min(1) if isinstance(count, Tensor) else count)
+    mean = total / (count.clamp_min(1) if isinstance(count, Tensor) else max(count, 1))
     return mean.mean() if reduction == "mean" else mean

@@ -1,7 +1,7 @@
 """Backward correspondence loss: a matching plan, applied forth and back, should return the pose mesh."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +13,8 @@ __all__ = ["BackwardCorrespondenceLoss", "PlanLike", "backward_correspondence_lo
 
 Form = Literal["coordinates", "matrix"]
 Normalization = Literal["rows", "both", "none"]
+
+_BLOCK = 512  # columns of the Gram matrix held at once by the matrix form
 
 
 class PlanLike(Protocol):
@@ -76,8 +78,10 @@ def backward_correspondence_loss(
         plan: T, a tensor ``(B, N, M)`` or an object as :class:`PlanLike` (whose padded rows and columns hold no mass);
             N identity vertices, M pose vertices, entries >= 0. Rows without mass contribute nothing.
         pose_verts: V ``(B, M, 3)``.
-        form: ``"coordinates"``, two products with the plan; or ``"matrix"``, which stores an ``(M, M)`` matrix per
-            sample and costs N M² operations.
+        form: ``"coordinates"``, two products with the plan, which is not stored. Or ``"matrix"``, which costs
+            2 N M min(N, M) operations and holds the smaller Gram matrix in blocks of 512 columns, never as a whole. It
+            stores T, ``(B, N, M)``, if T is a tensor or passes a gradient; else it reads blocks of T and stores no
+            matrix.
         normalization: ``"rows"``, ``"both"`` or ``"none"``, see above.
         mask: ``(B, M)`` bool, True = real pose vertex; None if all are real.
         identity_mask: ``(B, N)`` bool, True = real identity vertex. Only for plans that have mass in padded rows.
@@ -127,7 +131,7 @@ def backward_correspondence_loss(
         verts = at_least_float32(pose_verts)
         real = verts.new_ones(batch, num, dtype=torch.bool) if mask is None else mask
         if form == "matrix":
-            return _matrix_form(_real_block(plan, mask, identity_mask), real, normalization, reduction)
+            return _matrix_form(plan, real, mask, identity_mask, normalization, reduction)
         if isinstance(plan, Tensor):
             block = _real_block(plan, mask, identity_mask)
             dtype = torch.promote_types(block.dtype, verts.dtype)
@@ -163,11 +167,81 @@ def _coordinate_form(
     return reduce_samples((restored - verts).square().sum((1, 2)), 3 * real.sum(1), reduction)
 
 
-def _matrix_form(plan: Tensor, real: Tensor, normalization: Normalization, reduction: Reduction) -> Tensor:
-    if normalization == "rows":
-        plan = plan * _inverse_or_zero(plan.sum(2))[..., None]
-    residual = plan.mT @ plan - torch.diag_embed(real.to(plan.dtype))
-    return reduce_samples(residual.square().sum((1, 2)), real.sum(1).square(), reduction)
+def _matrix_form(
+    plan: Tensor | PlanLike,
+    real: Tensor,
+    mask: Tensor | None,
+    identity_mask: Tensor | None,
+    normalization: Normalization,
+    reduction: Reduction,
+) -> Tensor:
+    r"""The smaller of the two Gram matrices is enough: TᵀT and T Tᵀ have the same norm and trace, hence
+
+    .. math:: \lVert T^\top T - I_M \rVert_F^2 = \lVert T T^\top - I_N \rVert_F^2 + M - N.
+    """
+    batch, num_rows, num_columns = plan.shape
+    rows = real.new_ones(batch, num_rows) if identity_mask is None else identity_mask
+    wide = num_rows < num_columns
+    if isinstance(plan, Tensor) or (torch.is_grad_enabled() and plan.row_sums().requires_grad):
+        block = _real_block(plan, mask, identity_mask)
+        if normalization == "rows":
+            block = block * _inverse_or_zero(block.sum(2))[..., None]
+        total: Tensor = _GramResidual.apply(block.mT if wide else block, rows if wide else real)
+    else:
+        sums = plan.row_sums()
+        scale = (_inverse_or_zero(sums) if normalization == "rows" else torch.ones_like(sums)) * rows
+        total = _residual_by_products(plan, scale[..., None], rows if wide else real, wide)
+    if wide:
+        total = total + (real.sum(1) - rows.sum(1))
+    return reduce_samples(total, real.sum(1).square(), reduction)
+
+
+class _GramResidual(torch.autograd.Function):
+    """``|SᵀS - diag(real)|²`` of ``S (B, K, k)``, by blocks of columns; the gradient ``4 S (SᵀS - I)`` likewise.
+
+    Kept for the backward pass: S alone.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, factor: Tensor, real: Tensor) -> Tensor:
+        ctx.save_for_backward(factor, real)
+        parts = [_gram_residual(factor, real, block).square().sum((1, 2)) for block in _blocks(factor.shape[2])]
+        return torch.stack(parts).sum(0)
+
+    @staticmethod
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
+        factor, real = ctx.saved_tensors
+        gradient = torch.empty_like(factor)
+        for block in _blocks(factor.shape[2]):
+            gradient[:, :, block] = 4 * upstream[:, None, None] * (factor @ _gram_residual(factor, real, block))
+        return gradient, None
+
+
+def _blocks(size: int) -> list[slice]:
+    return [slice(start, min(start + _BLOCK, size)) for start in range(0, size, _BLOCK)]
+
+
+def _gram_residual(factor: Tensor, real: Tensor, block: slice) -> Tensor:
+    residual = factor.mT @ factor[:, :, block]
+    residual[:, block].diagonal(dim1=1, dim2=2).sub_(real[:, block].to(residual.dtype))
+    return residual
+
+
+def _residual_by_products(plan: PlanLike, scale: Tensor, real: Tensor, wide: bool) -> Tensor:
+    """The same from products with blocks of the identity, two for each block; no N x M matrix is stored."""
+    total = scale.new_zeros(len(scale))
+    for block in _blocks(real.shape[1]):
+        basis = _unit_columns(real, block, scale.dtype)
+        image = scale * (plan @ (plan.T @ (scale * basis))) if wide else plan.T @ (scale.square() * (plan @ basis))
+        total = total + (image - basis).square().sum((1, 2))
+    return total
+
+
+def _unit_columns(real: Tensor, block: slice, dtype: torch.dtype) -> Tensor:
+    """Columns ``block`` of the identity over the real entries, ``(B, k, block)``."""
+    basis = torch.zeros(*real.shape, block.stop - block.start, dtype=dtype, device=real.device)
+    basis[:, block].diagonal(dim1=1, dim2=2).copy_(real[:, block])
+    return basis
 
 
 def _real_block(plan: Tensor | PlanLike, mask: Tensor | None, identity_mask: Tensor | None) -> Tensor:

@@ -1,12 +1,10 @@
 """Edge length loss: squared lengths of the mesh edges."""
 
-import torch
 from torch import Tensor, nn
 
 from meshkit.batching import check_mask, check_verts
-from meshkit.losses._common import Reduction, at_least_float32, check_faces_match, check_reduction, reduce_samples
-from meshkit.scatter import segment_sum
-from meshkit.topology import unique_edges
+from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
+from meshkit.losses._connectivity import connectivity, edge_lengths
 
 __all__ = ["EdgeLengthLoss", "edge_length_loss"]
 
@@ -41,33 +39,19 @@ def edge_length_loss(
         code uses another loss, :func:`meshkit.losses.edge_ratio_loss`.
 
     Example:
+        >>> import torch
         >>> triangle = torch.tensor([[[0.0, 0, 0], [3, 0, 0], [0, 4, 0]]])
         >>> edge_length_loss(triangle, torch.tensor([[0, 1, 2]]), reduction="sum")  # 2 (9 + 16 + 25)
         tensor(100.)
     """
     check_reduction(reduction)
     check_verts(verts)
-    check_faces_match(verts, faces)
-    batch, num = verts.shape[:2]
-    check_mask(mask, batch, num)
-    tail, head = _packed_edges(faces, batch, num).unbind(-1)
-    packed = at_least_float32(verts).flatten(0, 1)
-    edge = packed[tail] - packed[head]
-    real = torch.ones_like(tail, dtype=torch.bool)
-    if mask is not None:
-        real = mask.flatten()[tail] & mask.flatten()[head]
-        edge = torch.where(real[:, None], edge, 0)
-    terms = torch.stack([edge.square().sum(-1), real.to(edge.dtype)], 1)
-    total, count = segment_sum(terms, tail // num, batch).unbind(1)
+    check_mask(mask, *verts.shape[:2])
+    mesh = connectivity(verts, faces)
+    real = None if mask is None else mesh.real(mask, mesh.edges)
+    total = mesh.totals(edge_lengths(mesh, at_least_float32(verts), real, squared=True), mesh.edge_counts)
+    count = mesh.counts(real, mesh.edge_counts, total)
     return reduce_samples(2 * total, 2 * count, reduction)
-
-
-def _packed_edges(faces: Tensor, batch: int, num: int) -> Tensor:
-    """Edges (E, 2) of the whole batch as one mesh, with vertex n of sample b at b * num + n."""
-    offset = num * torch.arange(batch, device=faces.device)[:, None, None]
-    if faces.ndim == 2:
-        return (unique_edges(faces) + offset).flatten(0, 1)
-    return unique_edges(torch.where(faces >= 0, faces + offset, -1).flatten(0, 1))
 
 
 class EdgeLengthLoss(nn.Module):
@@ -80,6 +64,7 @@ class EdgeLengthLoss(nn.Module):
         ValueError: if the reduction is unknown.
 
     Example:
+        >>> import torch
         >>> EdgeLengthLoss()(torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]]), torch.tensor([[0, 1, 2]])).item()
         1.3333333730697632
     """

@@ -4,7 +4,8 @@ import torch
 from torch import Tensor, nn
 
 from meshkit.batching import check_mask, check_verts
-from meshkit.losses._common import Reduction, at_least_float32, check_faces_match, check_reduction, reduce_samples
+from meshkit.losses._common import Reduction, check_reduction, check_same_shape, reduce_samples
+from meshkit.losses._connectivity import connectivity, edge_lengths
 
 __all__ = ["EdgeRatioLoss", "edge_ratio_loss"]
 
@@ -61,35 +62,25 @@ def edge_ratio_loss(
     _check_min_length(min_length)
     check_verts(verts)
     check_verts(reference, name="reference")
-    if verts.shape != reference.shape:
-        raise ValueError(
-            f"verts and reference must have the same shape, got {tuple(verts.shape)} and {tuple(reference.shape)}"
-        )
-    check_faces_match(verts, faces)
-    batch, num = verts.shape[:2]
-    check_mask(mask, batch, num)
-
-    sample = torch.arange(batch, device=faces.device)[:, None, None]
-    corners = faces.clamp_min(0).expand(batch, -1, -1)
-    real = (faces[..., 0] >= 0).expand(batch, -1)
+    check_same_shape(verts, reference, "verts and reference")
+    check_mask(mask, *verts.shape[:2])
+    mesh = connectivity(verts, faces)
+    dtype = torch.promote_types(torch.promote_types(verts.dtype, reference.dtype), torch.float32)
+    # Faces share edges: each is measured once, and counts for every face that has it.
+    weight = mesh.around[:, None].to(dtype)
+    real_face = real_edge = None
     if mask is not None:
-        real = real & mask[sample, corners].all(-1)
-    length, reference_length = (
-        _edge_lengths(at_least_float32(positions)[sample, corners], real) for positions in (verts, reference)
-    )
+        real_face = mesh.real(mask, mesh.faces.T)
+        sides = real_face.to(dtype).index_select(0, mesh.corners // 3)
+        weight = weight.new_zeros(len(weight), sides.shape[1]).index_add(0, mesh.corner_edges, sides)
+        real_edge = weight > 0
+    length, reference_length = (edge_lengths(mesh, positions.to(dtype), real_edge) for positions in (verts, reference))
     # Written so that NaN is not degenerate: a broken reference must show.
     degenerate = reference_length <= min_length
-    ratio = length / torch.where(degenerate, 1, reference_length)
-    terms = torch.where(degenerate, 0, (ratio - 1).abs())
-    return reduce_samples(terms.sum((1, 2)), real.sum(1), reduction)
-
-
-def _edge_lengths(corners: Tensor, real: Tensor) -> Tensor:
-    """Edge lengths (B, F, 3) of triangles (B, F, 3, 3); 0 with gradient 0 where not real or of zero length."""
-    edge = torch.where(real[..., None, None], corners.roll(-1, 2) - corners, 0)
-    squared = edge.square().sum(-1)
-    zero = squared == 0
-    return torch.where(zero, 0, torch.where(zero, 1, squared).sqrt())
+    # w |l / r - 1|, and exactly 0 where l = r
+    terms = ((length - reference_length) * (weight / reference_length.masked_fill(degenerate, torch.inf))).abs()
+    total = mesh.totals(terms, mesh.edge_counts)
+    return reduce_samples(total, mesh.counts(real_face, mesh.face_counts, total), reduction)
 
 
 def _check_min_length(min_length: float) -> None:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from meshkit.batching import check_mask, check_verts
-from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
+from meshkit.losses._common import Reduction, at_least_float32, check_reduction, check_same_shape, reduce_samples
 
 __all__ = ["ReconstructionLoss", "reconstruction_loss"]
 
@@ -47,8 +47,7 @@ def reconstruction_loss(
     check_reduction(reduction)
     check_verts(pred, name="pred")
     check_verts(target, name="target")
-    if pred.shape != target.shape:
-        raise ValueError(f"pred and target must have the same shape, got {tuple(pred.shape)} and {tuple(target.shape)}")
+    check_same_shape(pred, target, "pred and target")
     check_mask(mask, pred.shape[0], pred.shape[1])
     residual = at_least_float32(pred) - at_least_float32(target)
     count: Tensor | int = 3 * pred.shape[1]

@@ -1,19 +1,57 @@
 """Chamfer distance between two vertex sets."""
 
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args, overload
 
 import torch
 from torch import Tensor
 
-from meshkit.batching import check_mask, check_verts
+from meshkit.metrics._common import check_clouds, common_dtype, length
 from meshkit.neighbors import gather_vertices, knn
 
-__all__ = ["chamfer_distance"]
+__all__ = ["ChamferDetails", "chamfer_distance"]
 
 Direction = Literal["both", "forward", "backward"]
 PointReduction = Literal["mean", "sum"]
 
 
+class ChamferDetails(NamedTuple):
+    """Chamfer distance and the distance of each point to the other set, squared if asked for; 0 at padded points.
+
+    Args:
+        value: ``(B,)``.
+        forward: ``(B, N)``, of each predicted point; None if that direction was not asked for.
+        backward: ``(B, M)``, of each target point; None likewise.
+    """
+
+    value: Tensor
+    forward: Tensor | None
+    backward: Tensor | None
+
+
+@overload
+def chamfer_distance(
+    pred: Tensor,
+    target: Tensor,
+    *,
+    pred_mask: Tensor | None = ...,
+    target_mask: Tensor | None = ...,
+    squared: bool = ...,
+    point_reduction: PointReduction = ...,
+    direction: Direction = ...,
+    return_distances: Literal[False] = ...,
+) -> Tensor: ...
+@overload
+def chamfer_distance(
+    pred: Tensor,
+    target: Tensor,
+    *,
+    pred_mask: Tensor | None = ...,
+    target_mask: Tensor | None = ...,
+    squared: bool = ...,
+    point_reduction: PointReduction = ...,
+    direction: Direction = ...,
+    return_distances: Literal[True],
+) -> ChamferDetails: ...
 def chamfer_distance(
     pred: Tensor,
     target: Tensor,
@@ -23,7 +61,8 @@ def chamfer_distance(
     squared: bool = True,
     point_reduction: PointReduction = "mean",
     direction: Direction = "both",
-) -> Tensor:
+    return_distances: bool = False,
+) -> Tensor | ChamferDetails:
     r"""Distance from each point to the nearest point of the other set; no correspondence is needed.
 
     .. math::
@@ -44,6 +83,7 @@ def chamfer_distance(
         point_reduction: ``"mean"`` or ``"sum"`` over the points of each direction.
         direction: ``"both"``, or one sum alone: ``"forward"`` from each predicted point to the target, ``"backward"``
             from each target point to the prediction.
+        return_distances: return a :class:`ChamferDetails` with the distance of each point as well.
 
     Returns:
         ``(B,)``, in squared units of length, or units of length; at least float32. NaN if a point to start from is NaN;
@@ -63,43 +103,38 @@ def chamfer_distance(
         >>> p, q = torch.zeros(1, 1, 3), torch.tensor([[[2.0, 0, 0], [4, 0, 0]]])
         >>> chamfer_distance(p, q)  # 2² + (2² + 4²) / 2
         tensor([14.])
+        >>> chamfer_distance(p, q, squared=False, return_distances=True).backward
+        tensor([[2., 4.]])
     """
     if direction not in get_args(Direction):
         raise ValueError(f"direction must be one of {get_args(Direction)}, got {direction!r}")
     if point_reduction not in get_args(PointReduction):
         raise ValueError(f"point_reduction must be one of {get_args(PointReduction)}, got {point_reduction!r}")
-    check_verts(pred, name="pred")
-    check_verts(target, name="target")
-    if len(pred) != len(target):
-        raise ValueError(f"pred and target must have the same batch size, got {len(pred)} and {len(target)}")
-    check_mask(pred_mask, pred.shape[0], pred.shape[1], name="pred_mask", nonempty=True)
-    check_mask(target_mask, target.shape[0], target.shape[1], name="target_mask", nonempty=True)
-    dtype = torch.promote_types(torch.promote_types(pred.dtype, target.dtype), torch.float32)
+    check_clouds(pred, target, pred_mask, target_mask)
+    dtype = common_dtype(pred, target)
     pred, target = pred.to(dtype), target.to(dtype)
-    total = pred.new_zeros(len(pred))
+    total, forward, backward = pred.new_zeros(len(pred)), None, None
     if direction != "backward":
-        total = total + _one_sided(pred, target, pred_mask, target_mask, squared, point_reduction)
+        forward = _to_nearest(pred, target, pred_mask, target_mask, squared)
+        total = total + _reduce(forward, pred_mask, point_reduction)
     if direction != "forward":
-        total = total + _one_sided(target, pred, target_mask, pred_mask, squared, point_reduction)
-    return total
+        backward = _to_nearest(target, pred, target_mask, pred_mask, squared)
+        total = total + _reduce(backward, target_mask, point_reduction)
+    return ChamferDetails(total, forward, backward) if return_distances else total
 
 
-def _one_sided(
-    points: Tensor,
-    others: Tensor,
-    mask: Tensor | None,
-    others_mask: Tensor | None,
-    squared: bool,
-    point_reduction: PointReduction,
+def _to_nearest(
+    points: Tensor, others: Tensor, mask: Tensor | None, others_mask: Tensor | None, squared: bool
 ) -> Tensor:
-    nearest = gather_vertices(others, knn(others, 1, query=points, mask=others_mask)[..., 0])
-    difference = points - nearest
-    count: Tensor | int = points.shape[1]
+    """(B, N): distance of each point to the nearest of the others, 0 where masked."""
+    difference = points - gather_vertices(others, knn(others, 1, query=points, mask=others_mask)[..., 0])
     if mask is not None:
         difference = torch.where(mask[..., None], difference, 0)
-        count = mask.sum(1)
     distance = difference.square().sum(2)
-    if not squared:
-        zero = distance == 0
-        distance = torch.where(zero, 0, torch.where(zero, 1, distance).sqrt())
-    return distance.sum(1) if point_reduction == "sum" else distance.sum(1) / count
+    return distance if squared else length(distance)
+
+
+def _reduce(distance: Tensor, mask: Tensor | None, point_reduction: str) -> Tensor:
+    if point_reduction == "sum":
+        return distance.sum(1)
+    return distance.sum(1) / (distance.shape[1] if mask is None else mask.sum(1))

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from meshkit.batching import center, check_mask, check_verts, masked_mean
+from meshkit.batching import center, masked_mean
+from meshkit.metrics._common import check_pair
 
 __all__ = ["pmd"]
 
@@ -41,11 +42,7 @@ def pmd(pred: Tensor, target: Tensor, *, mask: Tensor | None = None, recenter: b
         >>> pmd(2 * target + 5, target)  # one of three coordinates is off by 1
         tensor([0.3333])
     """
-    check_verts(pred, name="pred")
-    check_verts(target, name="target")
-    if pred.shape != target.shape:
-        raise ValueError(f"pred and target must have the same shape, got {tuple(pred.shape)} and {tuple(target.shape)}")
-    check_mask(mask, pred.shape[0], pred.shape[1], nonempty=True)
+    check_pair(pred, target, mask)
     pred = pred.to(torch.promote_types(pred.dtype, torch.float32))
     residual = (center(pred, mask) if recenter else pred) - target
     if mask is not None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from meshkit.ot.kernel import refuse_second_derivative
 from meshkit.ot.tiles import LOG2_E
 
 
@@ -23,7 +26,9 @@ def logit_features(
     if cost == "cosine":
         x, y = unit(x), unit(y)
         if not constant:
-            return x * rate, y, 2 / value, 1.0
+            # The smaller side is scaled, since that takes a copy.
+            x, y = (x, y * rate) if len(x) > len(y) else (x * rate, y)
+            return x, y, 2 / value, 1.0
         x = torch.cat([x, -torch.ones_like(x[:, :1])], 1) * rate
         return x, torch.cat([y, y.new_ones(len(y), 1)], 1), 2 / value, 0.0
     # |x - y|² = |x|² + |y|² - 2 x·y as one inner product; centred, so that less cancels.
@@ -43,9 +48,27 @@ def norms(x: Tensor) -> Tensor:
 
 def unit(x: Tensor) -> Tensor:
     """Rows of unit norm; zero rows stay zero, with zero gradient."""
-    # Divided by its largest entry first, a row's norm neither over- nor underflows; the direction does not change.
-    largest = x.detach().abs().amax(1, keepdim=True)
-    alive = largest > 0
-    x = x / torch.where(alive, largest, 1.0)
-    squared = x.square().sum(1, keepdim=True)
-    return x * torch.where(alive, torch.where(alive, squared, 1.0).rsqrt(), 0.0)
+    return _Unit.apply(x)
+
+
+class _Unit(torch.autograd.Function):
+    """y = x / |x|, dx = (dy - y (y·dy)) / |x|: nothing of the size of x is kept besides y."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        # Divided by its largest entry first, a row's norm neither over- nor underflows.
+        largest = x.abs().amax(1, keepdim=True)
+        alive = largest > 0
+        largest = torch.where(alive, largest, 1.0)
+        y = x / largest
+        inverse = torch.where(alive, y.square().sum(1, keepdim=True).rsqrt(), 0.0)
+        y *= inverse
+        ctx.save_for_backward(y, inverse / largest)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        refuse_second_derivative()
+        y, inverse = ctx.saved_tensors
+        along = (gradient * y).sum(1, keepdim=True)
+        return torch.addcmul(gradient, y, along, value=-1).mul_(inverse)

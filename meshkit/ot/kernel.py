@@ -9,32 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from meshkit.ot.tiles import Factors, Reference, Tiles
 
-P = ParamSpec("P")
-R = TypeVar("R")
-
 NO_SECOND_DERIVATIVE = (
     "sinkhorn has no second derivatives: its gradient is computed without a graph of its own. Leave out create_graph, "
     "or differentiate a dense plan written with torch operations"
 )
-
-
-def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Let torch.compile step around a function whose gradients are gathered across calls, which it cannot trace."""
-
-    @wraps(function)
-    def run(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling():
-            return torch.compiler.disable(function)(*args, **kwargs)
-        return function(*args, **kwargs)
-
-    return run
 
 
 def full_precision(method: Callable[..., Any]) -> Callable[..., Any]:

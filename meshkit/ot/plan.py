@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from meshkit.ot.kernel import uncompiled
+from meshkit._compile import uncompiled
 from meshkit.ot.sample import SamplePlan, pad_columns, spread
 
 __all__ = ["TransportPlan"]

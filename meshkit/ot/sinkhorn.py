@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from meshkit._compile import uncompiled
 from meshkit.ot.costs import logit_features
 from meshkit.ot.iterations import iterate_kernel, iterate_log
-from meshkit.ot.kernel import GibbsKernel, uncompiled
+from meshkit.ot.kernel import GibbsKernel
 from meshkit.ot.marginals import Sides, check_totals, pick, weights
 from meshkit.ot.options import Cost, Domain, Eps, Grad, Options, Reach, Store, check_choice, read_options
 from meshkit.ot.plan import TransportPlan
