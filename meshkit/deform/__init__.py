@@ -1,14 +1,21 @@
 """Deformation of meshes: as-rigid-as-possible, with gradients."""
 
-from meshkit.deform.arap import ARAPInfo, arap_deform, arap_energy
+from meshkit.deform.arap import PRESETS, ARAPInfo, arap_deform, arap_energy
 from meshkit.deform.deformer import ARAPDeformer
+from meshkit.deform.factor import ARAPFactor
 from meshkit.deform.moving_least_squares import rigid_moving_least_squares
+from meshkit.deform.rest import ARAPRest
 from meshkit.deform.rotation import closest_rotation
+from meshkit.deform.topology import ARAPTopology
 from meshkit.topology import cotangent_laplacian, mass_matrix
 
 __all__ = [
+    "PRESETS",
     "ARAPDeformer",
+    "ARAPFactor",
     "ARAPInfo",
+    "ARAPRest",
+    "ARAPTopology",
     "arap_deform",
     "arap_energy",
     "closest_rotation",

@@ -3,8 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from meshkit.deform.arap import check_options, solve
+from meshkit.deform.arap import ARAPInfo, Options, check_options, deform, uncompiled
 from meshkit.deform.problem import Problem
+from meshkit.deform.topology import check_energy
 
 __all__ = ["ARAPDeformer"]
 
@@ -20,17 +21,23 @@ class ARAPDeformer(nn.Module):
 
     Args:
         fraction: share of the vertices that are handles, in (0, 1].
-        energy: see :func:`meshkit.deform.arap_deform`. The paper's setting is "spokes".
-        max_iter: local-global iterations from rest.
-        grad: "unroll" lets the gradient reach `target` through the handles; "none" returns a constant.
+        energy: see :func:`meshkit.deform.arap_energy`. The paper's setting is "spokes".
+        method: "lbfgs" or "local_global", see :func:`meshkit.deform.arap_deform`. None takes "local_global" for
+            ``grad="unroll"``, which needs it, and for "spokes", the paper's setting, and "lbfgs" otherwise.
+        max_iter: evaluations, or iterations from rest, at most.
+        tol: residual at which to stop; None is 0 for "local_global", which then does all its iterations, else 1e-7.
+        grad: "implicit" differentiates the minimum with respect to `rest` and `target`; "unroll" the iterations with
+            respect to `target`; "none" returns a constant.
+        grad_tol, solver, compiled, degenerate: see :func:`meshkit.deform.arap_deform`.
         generator: source of the random handles; None uses the global CPU generator, so that ``torch.manual_seed``
             repeats a run on any device and differently seeded processes draw different handles.
 
     Raises:
-        ValueError: `fraction` is not in (0, 1], or an unknown `grad` or `max_iter`.
+        ValueError: `fraction` is not in (0, 1], or an unknown option.
 
     Reference:
-        X-DualNet, section "ARAP deformer" and implementation details: 10 % of the vertices, 50 iterations.
+        X-DualNet, section "ARAP deformer" and implementation details: 10 % of the vertices, 50 iterations:
+        ``ARAPDeformer(**PRESETS["xdualnet"])``.
 
     Deviations:
         The released code records no gradient (``grad="none"``), so its losses on the deformed mesh are constants.
@@ -48,16 +55,29 @@ class ARAPDeformer(nn.Module):
         fraction: float = 0.1,
         *,
         energy: str = "spokes_and_rims",
+        method: str | None = None,
         max_iter: int = 50,
-        grad: str = "unroll",
+        tol: float | None = None,
+        grad: str = "implicit",
+        grad_tol: float = 1e-3,
+        solver: str = "splu",
+        compiled: bool = False,
+        degenerate: str = "raise",
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         if not 0 < fraction <= 1:
             raise ValueError(f"fraction must be in (0, 1], got {fraction}")
-        check_options(max_iter, grad)
-        self.fraction, self.energy, self.max_iter, self.grad = fraction, energy, max_iter, grad
-        self.generator = generator
+        check_energy(energy)
+        if method is None:
+            method = "local_global" if grad == "unroll" or energy == "spokes" else "lbfgs"
+        if tol is None:
+            tol = 0.0 if method == "local_global" else 1e-7
+        check_options(method, max_iter, tol, grad, grad_tol, solver, degenerate)
+        self.fraction, self.energy, self.generator = fraction, energy, generator
+        self.degenerate = degenerate
+        self.options = Options(method, max_iter, tol, grad, grad_tol, solver, compiled)
+        self.info: ARAPInfo | None = None
 
     def forward(
         self,
@@ -72,7 +92,7 @@ class ARAPDeformer(nn.Module):
         """Deform.
 
         Args:
-            rest: (B, V, 3) or (V, 3) rest positions. Treated as constants.
+            rest: (B, V, 3) or (V, 3) rest positions; differentiable for ``grad="implicit"``.
             target: positions of the shape of `rest`; differentiable at the handles.
             faces: (F, 3) shared by the batch, or (B, F, 3) padded with -1.
             mask: (B, V) bool (or (V,)), True at real vertices.
@@ -80,36 +100,54 @@ class ARAPDeformer(nn.Module):
             generator: source of the random handles for this call, instead of the module's.
 
         Returns:
-            Deformed positions of the shape, dtype and device of `rest`; zeros at padding.
+            Deformed positions of the shape, dtype and device of `rest`; zeros at padding. How it ended is in the
+            attribute ``info``, an :class:`meshkit.deform.ARAPInfo`.
 
         Raises:
             ValueError: see :func:`meshkit.deform.arap_deform`.
         """
-        problem = Problem(rest, faces, mask, self.energy)
-        with torch.set_grad_enabled(torch.is_grad_enabled() and self.grad == "unroll"):
-            joined = problem.join(target, "target")
-            if handles is None:
-                fixed = random_handles(problem, self.fraction, generator or self.generator)
-            else:
-                fixed, _ = problem.join_handles(handles)
-            return solve(problem, fixed, joined[fixed], None, self.max_iter, 0.0)[0]
+        deformed, self.info = self._deform(rest, target, faces, mask, handles, generator)
+        return deformed
+
+    @uncompiled
+    def _deform(
+        self,
+        rest: Tensor,
+        target: Tensor,
+        faces: Tensor,
+        mask: Tensor | None,
+        handles: Tensor | None,
+        generator: torch.Generator | None,
+    ) -> tuple[Tensor, ARAPInfo]:
+        problem = Problem(rest, faces, mask, self.energy, self.degenerate)
+        goals = problem.split(target, "target")
+        if handles is None:
+            own = random_handles(problem, self.fraction, generator or self.generator)
+        else:
+            own, _ = problem.handles(handles, needed=True)
+        none = [None] * problem.batch
+        targets = [goal[index] for goal, index in zip(goals, own, strict=True)]
+        return deform(problem, own, targets, none, none, none, self.options)
 
     def extra_repr(self) -> str:
         """Options in the printed form of the module."""
-        return f"fraction={self.fraction}, energy={self.energy!r}, max_iter={self.max_iter}, grad={self.grad!r}"
+        options = self.options
+        return (
+            f"fraction={self.fraction}, energy={self.energy!r}, method={options.method!r}, "
+            f"max_iter={options.max_iter}, tol={options.tol}, grad={options.grad!r}"
+        )
 
 
-def random_handles(problem: Problem, fraction: float, generator: torch.Generator | None) -> Tensor:
-    """Union indices of random handles: a share of every mesh, after one vertex of every component."""
-    components, sample = problem.operators.components, problem.sample
+def random_handles(problem: Problem, fraction: float, generator: torch.Generator | None) -> list[Tensor]:
+    """Random handles of each mesh: a share of its vertices, after one vertex of every component."""
+    sizes = [len(real) for real in problem.real]
     device = "cpu" if generator is None else generator.device
-    score = torch.rand(len(sample), generator=generator, device=device, dtype=torch.float64).cpu()
-    best = score.new_zeros(int(components.max()) + 1).scatter_reduce(0, components, score, "amax")
-    forced = score == best[components]
-    score = score + forced
-    # Sort by mesh, then by falling score; a vertex is a handle when its rank in its mesh is below the mesh's quota.
-    order = torch.argsort(2.5 * sample - score)
-    sizes = torch.bincount(sample, minlength=problem.batch)
-    quota = torch.maximum((fraction * sizes).round().long(), torch.bincount(sample, forced.double()).long())
-    rank = torch.arange(len(order)) - (sizes.cumsum(0) - sizes)[sample[order]]
-    return order[rank < quota[sample[order]]]
+    scores = torch.rand(sum(sizes), generator=generator, device=device, dtype=torch.float64).cpu()
+    chosen = []
+    for rest, size, score in zip(problem.rests, sizes, scores.split(sizes), strict=True):
+        components = rest.components
+        best = score.new_zeros(int(components.max()) + 1).scatter_reduce(0, components, score, "amax")
+        forced = score == best[components]
+        quota = max(round(fraction * size), int(forced.sum()))
+        chosen.append(torch.topk(score + forced, quota).indices)
+    return chosen

@@ -1,29 +1,30 @@
-"""A batch of meshes joined into one disjoint union: validation, index bookkeeping, and the way back."""
+"""A batch of meshes taken apart: validation, index bookkeeping, and the way back."""
 
 import torch
 from torch import Tensor
 
-from meshkit.deform.operators import RestOperators
+from meshkit.deform.rest import ARAPRest
+from meshkit.deform.topology import ARAPTopology, check_energy
 from meshkit.topology import check_faces
 
 __all__ = ["Problem"]
 
+_CPU = torch.device("cpu")
+
 
 class Problem:
-    """Rest shape of a batch, flattened to the N real vertices of all meshes, in float64 on the CPU.
+    """The meshes of a batch one by one, without padding, in float64 on the CPU.
 
     Attributes:
-        shape: shape of the given positions, (V, 3) or (B, V, 3).
+        shape, dtype, device: of the given positions, (V, 3) or (B, V, 3).
         batch: number of meshes B; 1 for unbatched input.
-        real: (N,) indices of the real vertices among the B * V.
-        sample: (N,) mesh of every real vertex.
-        verts: (N, 3) rest positions.
-        operators: the rest operators of the union.
+        real: per mesh, the indices of its real vertices.
+        verts: per mesh, the (n, 3) rest positions; differentiable.
+        rests: per mesh, the operators of its rest shape.
     """
 
-    def __init__(self, verts: Tensor, faces: Tensor, mask: Tensor | None, energy: str) -> None:
-        if energy not in ("spokes_and_rims", "spokes"):
-            raise ValueError(f'energy must be "spokes_and_rims" or "spokes", got {energy!r}')
+    def __init__(self, verts: Tensor, faces: Tensor, mask: Tensor | None, energy: str, degenerate: str) -> None:
+        check_energy(energy)
         if verts.dim() not in (2, 3) or verts.shape[-1] != 3 or not verts.is_floating_point():
             raise ValueError(
                 f"verts must be a floating (V, 3) or (B, V, 3) tensor, got {verts.dtype} {tuple(verts.shape)}"
@@ -31,54 +32,74 @@ class Problem:
         self.shape, self.dtype, self.device = verts.shape, verts.dtype, verts.device
         self.batch, self.size = (1 if verts.dim() == 2 else len(verts)), verts.shape[-2]
         self.real = self._real(mask)
-        self.sample = self.real // self.size
-        # index of every padded-layout vertex in the union, -1 at padding
-        self.position = torch.full((self.batch * self.size,), -1, dtype=torch.int64)
-        self.position[self.real] = torch.arange(len(self.real))
-        self.verts = self.join(verts.detach(), "verts")
-        self.operators = RestOperators(self.verts, self._join_faces(faces), energy)
+        # index of every vertex among the real ones of its mesh, -1 at padding
+        self.place = torch.full((self.batch, self.size), -1, dtype=torch.int64, device=_CPU)
+        for place, real in zip(self.place, self.real, strict=True):
+            place[real] = torch.arange(len(real), device=_CPU)
+        self.verts = self.split(verts, "verts")
+        self.rests = [
+            ARAPRest(ARAPTopology.cached(own, len(rows), energy=energy), rows, degenerate=degenerate)
+            for own, rows in zip(self._faces(faces), self.verts, strict=True)
+        ]
 
-    def _real(self, mask: Tensor | None) -> Tensor:
+    def _real(self, mask: Tensor | None) -> list[Tensor]:
         if mask is None:
-            return torch.arange(self.batch * self.size)
+            return [torch.arange(self.size, device=_CPU)] * self.batch
         if mask.dtype != torch.bool or mask.shape != self.shape[:-1]:
             raise ValueError(
                 f"mask must be bool of shape {tuple(self.shape[:-1])}, got {mask.dtype} {tuple(mask.shape)}"
             )
-        return mask.cpu().flatten().nonzero().squeeze(1)
+        return [row.nonzero().squeeze(1) for row in mask.cpu().view(self.batch, -1)]
 
-    def _join_faces(self, faces: Tensor) -> Tensor:
+    def _faces(self, faces: Tensor) -> list[Tensor]:
         check_faces(faces, self.size, batched=len(self.shape) == 3)
         if faces.dim() == 3 and len(faces) != self.batch:
             raise ValueError(f"faces {tuple(faces.shape)} and verts {tuple(self.shape)} differ in batch size")
-        joined = self._offset(faces.detach().cpu().long().expand(self.batch, -1, 3))
-        joined = self.position[joined[joined[..., 0] >= 0]]
-        padded = int((joined < 0).any(-1).sum())
+        rows = faces.detach().cpu().long().expand(self.batch, -1, 3)
+        own = [place[row[row[:, 0] >= 0]] for place, row in zip(self.place, rows, strict=True)]
+        padded = sum(int((f < 0).any(-1).sum()) for f in own)
         if padded:
             raise ValueError(f"{padded} faces use a vertex that mask declares padding")
-        return joined
+        return own
 
-    def _offset(self, indices: Tensor) -> Tensor:
-        """Per-mesh indices to indices of the padded layout; -1 stays -1."""
-        offsets = self.size * torch.arange(self.batch).view(-1, *([1] * (indices.dim() - 1)))
-        return torch.where(indices >= 0, indices + offsets, -1)
-
-    def join(self, positions: Tensor, name: str) -> Tensor:
-        """(N, 3) positions of the real vertices; differentiable."""
+    def split(self, positions: Tensor, name: str) -> list[Tensor]:
+        """Positions (n, 3) of the real vertices of each mesh; differentiable."""
         if positions.shape != self.shape:
             raise ValueError(f"{name} must have the shape of verts {tuple(self.shape)}, got {tuple(positions.shape)}")
-        joined = positions.reshape(-1, 3).cpu().double().index_select(0, self.real)
-        if not torch.isfinite(joined).all():
+        return self._rows(positions.reshape(self.batch, self.size, 3), name)
+
+    def split_weights(self, weights: Tensor, name: str) -> list[Tensor]:
+        """Weights (n,) of the real vertices of each mesh; differentiable."""
+        either = {tuple(self.shape[:-1]), (self.size,)}
+        if tuple(weights.shape) not in either:
+            wanted = " or ".join(str(shape) for shape in sorted(either, key=len))
+            raise ValueError(f"{name} must have shape {wanted}, got {tuple(weights.shape)}")
+        rows = self._rows(weights.expand(self.shape[:-1]).reshape(self.batch, self.size), name)
+        negative = sum(int((row < 0).sum()) for row in rows)
+        if negative:
+            raise ValueError(f"{negative} {name} are negative; use 0 where there is no target")
+        return rows
+
+    def _rows(self, values: Tensor, name: str) -> list[Tensor]:
+        values = values.cpu().double()
+        rows = [row.index_select(0, real) for row, real in zip(values.unbind(0), self.real, strict=True)]
+        if not all(bool(torch.isfinite(row).all()) for row in rows):
             raise ValueError(f"{name} holds NaN or infinity at a real vertex")
-        return joined
+        return rows
 
-    def split(self, joined: Tensor) -> Tensor:
-        """Inverse of `join`, with zeros at padding."""
-        flat = joined.new_zeros(self.batch * self.size, 3).index_copy(0, self.real, joined)
-        return flat.view(self.shape).to(self.device, self.dtype)
+    def join(self, rows: list[Tensor]) -> Tensor:
+        """Inverse of `split`, with zeros at padding."""
+        padded = [
+            row.new_zeros(self.size, 3).index_copy(0, real, row) for row, real in zip(rows, self.real, strict=True)
+        ]
+        return torch.stack(padded).view(self.shape).to(self.device, self.dtype)
 
-    def join_handles(self, handles: Tensor) -> tuple[Tensor, Tensor]:
-        """Union indices (H,) of the handles of all meshes, and which of the (B, H) given ones they are."""
+    def per_mesh(self, values: list[Tensor]) -> Tensor:
+        """One value per mesh as (B,), or () for unbatched input."""
+        return torch.stack(values) if len(self.shape) == 3 else values[0]
+
+    def handles(self, handles: Tensor, *, needed: bool) -> tuple[list[Tensor], Tensor]:
+        """Handles of each mesh as indices of its real vertices, and which of the given (B, H) they are."""
         dims = (1, 2) if len(self.shape) == 3 else (1,)
         if handles.is_floating_point() or handles.dtype == torch.bool or handles.dim() not in dims:
             wanted = "(H,) or (B, H)" if len(dims) == 2 else "(H,)"
@@ -93,46 +114,22 @@ class Problem:
             )
         used = handles >= 0
         bare = int((~used.any(1)).sum())
-        if bare:
-            raise ValueError(f"{bare} of {self.batch} meshes have no handle; give each at least one")
-        fixed = self.position[self._offset(handles)[used]]
-        padded = int((fixed < 0).sum())
+        if bare and needed:
+            raise ValueError(f"{bare} of {self.batch} meshes have no handle; give each at least one, or soft targets")
+        own = [place[row[taken]] for place, row, taken in zip(self.place, handles, used, strict=True)]
+        padded = sum(int((h < 0).sum()) for h in own)
         if padded:
             raise ValueError(f"{padded} handles are vertices that mask declares padding")
-        repeated = len(fixed) - len(fixed.unique())
-        if repeated:
-            raise ValueError(f"{repeated} handles repeat an earlier one of the same mesh; list each vertex once")
-        self._check_anchored(fixed)
-        return fixed, used
+        return own, used
 
-    def join_targets(self, handle_pos: Tensor, used: Tensor) -> Tensor:
-        """Positions (H, 3) of the used handles; differentiable."""
+    def targets(self, handle_pos: Tensor, used: Tensor) -> list[Tensor]:
+        """Positions (h, 3) of the used handles of each mesh; differentiable."""
         wanted = (used.shape[1], 3)
         if handle_pos.shape not in (wanted, (*self.shape[:-2], *wanted)):
             either = f"{wanted} or {(self.batch, *wanted)}" if len(self.shape) == 3 else f"{wanted}"
             raise ValueError(f"handle_pos must have shape {either} like handles, got {tuple(handle_pos.shape)}")
-        targets = handle_pos.cpu().double().expand(self.batch, *wanted)[used]
-        if not torch.isfinite(targets).all():
+        rows = handle_pos.cpu().double().expand(self.batch, *wanted).unbind(0)
+        own = [row[taken] for row, taken in zip(rows, used, strict=True)]
+        if not all(bool(torch.isfinite(row).all()) for row in own):
             raise ValueError("handle_pos holds NaN or infinity")
-        return targets
-
-    def _check_anchored(self, fixed: Tensor) -> None:
-        sizes = torch.bincount(self.operators.components)
-        loose = torch.ones(len(sizes), dtype=torch.bool)
-        loose[self.operators.components[fixed]] = False
-        isolated = int((loose & (sizes == 1)).sum())
-        if isolated:
-            raise ValueError(
-                f"{isolated} vertices are in no face of positive area and are no handles, so nothing determines them; "
-                "remove them, mask them out, or make them handles"
-            )
-        if loose.any():
-            raise ValueError(
-                f"{int(loose.sum())} connected components have no handle, so nothing holds them; "
-                "give each component at least one handle"
-            )
-
-    def per_mesh(self, values: Tensor) -> Tensor:
-        """Sum (N,) values over each mesh: (B,), or () for unbatched input."""
-        summed = values.new_zeros(self.batch).index_add(0, self.sample, values)
-        return summed if len(self.shape) == 3 else summed[0]
+        return own

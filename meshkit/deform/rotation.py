@@ -4,6 +4,8 @@ Inside this file matrices are stored component first, (3, 3, N): each elementwis
 contiguous row, which on a CPU is an order of magnitude faster than batched 3 x 3 linear algebra.
 """
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import torch
@@ -67,19 +69,87 @@ class ClosestRotation(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor, None]:
         """Solve the self-adjoint 3 x 3 system for the axial vector of the upstream gradient."""
-        S, R = ctx.saved_tensors
+        return RotationDifferential(*ctx.saved_tensors)(grad), None
+
+
+class RotationDifferential:
+    """The self-adjoint linear map from a change of S to that of its rotation R, component first."""
+
+    def __init__(self, S: Tensor, R: Tensor) -> None:
         tiny, eps = torch.finfo(S.dtype).tiny, torch.finfo(S.dtype).eps
-        scale = S.abs().amax((0, 1)).clamp_min(tiny)
-        M = _curvature(_transposed_product(R, S / scale))
+        self.R, self.scale = R, S.abs().amax((0, 1)).clamp_min(tiny)
+        M = _curvature(_transposed_product(R, S / self.scale))
         cofactors, det = _cofactors(M)
         # 1 / tr(M^-1) is the smallest eigenvalue of M up to a factor of 3: shift only where that is negligible.
         smallest = det / (cofactors[0] + cofactors[1] + cofactors[2]).clamp_min(tiny)
         shift = torch.relu(eps**0.5 * (M[0] + M[1] + M[2]) - smallest)
         cofactors, det = _cofactors(torch.cat([M[:3] + shift, M[3:]]))
-        torque = _axial(_transposed_product(R, grad)) / scale
-        x, y, z = (_symmetric_product(cofactors, torque) / det.clamp_min(tiny)).unbind(0)
-        a, b, c = R.unbind(1)
-        return torch.stack([b * z - c * y, c * x - a * z, a * y - b * x], 1), None
+        self.inverse = cofactors / det.clamp_min(tiny)
+
+    def __call__(self, dS: Tensor) -> Tensor:
+        """Apply the map to (3, 3, N)."""
+        x, y, z = _symmetric_product(self.inverse, _axial(_transposed_product(self.R, dS)) / self.scale).unbind(0)
+        a, b, c = self.R.unbind(1)
+        return torch.stack([b * z - c * y, c * x - a * z, a * y - b * x], 1)
+
+
+class RotationTracker:
+    """Closest rotations of matrices that change little between calls: Newton's method on SO(3) from the last ones.
+
+    Args:
+        compiled: run the step through torch.compile, which pays after some dozens of calls.
+        slack: squared half angle of a last step that is small enough; the error left is about its 3/2th power.
+    """
+
+    def __init__(self, *, compiled: bool = False, slack: float = 1e-2) -> None:
+        self.step = _compiled_step() if compiled else newton_step
+        self.slack = slack
+        self.last: tuple[Tensor, Tensor] | None = None
+
+    def start(self, count: int, dtype: torch.dtype) -> None:
+        """Begin at the identity."""
+        q = torch.eye(4, 1, dtype=dtype, device="cpu").repeat(1, count)
+        self.last = q, _rotation_matrix(q)
+
+    def __call__(self, S: Tensor) -> Tensor:
+        """Rotations of (3, 3, N) matrices of a scale near 1."""
+        if self.last is None:
+            self.last = _project(S, None)
+            return self.last[1]
+        q, R = (last.to(S.dtype) for last in self.last)
+        for attempt in range(3):
+            q, R, angle = self.step(q, R, S)
+            if float(angle.amax()) < self.slack:
+                break
+            far = (angle > 0.06).nonzero().squeeze(1)
+            if attempt < 2 and len(far):
+                q[:, far], R[:, :, far] = _project(S[:, :, far], None)
+        self.last = q, R
+        return R
+
+
+def newton_step(q: Tensor, R: Tensor, S: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Move unit quaternions (4, N), and their R, towards the rotations closest to S; also the squared half angles.
+
+    The angle is 9 where the second derivatives do not certify a maximum.
+    """
+    P = _transposed_product(R, S)
+    M = _curvature(P)
+    cofactors, det = _cofactors(M)
+    certified = (M[0] >= 0) & (cofactors[2] >= 0) & (det >= 0)
+    x, y, z = half = _symmetric_product(cofactors, _axial(P)) * (0.5 / det.clamp_min(1e-30))
+    angle = half.square().sum(0)
+    a, b, c, d = q
+    q = torch.stack(
+        [a - b * x - c * y - d * z, b + a * x + c * z - d * y, c + a * y + d * x - b * z, d + a * z + b * y - c * x]
+    )
+    q = q * q.square().sum(0).rsqrt()
+    return q, _rotation_matrix(q), torch.where(certified, angle, 9.0)
+
+
+@cache
+def _compiled_step() -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
+    return torch.compile(newton_step, dynamic=True)
 
 
 def _project(S: Tensor, guess: Tensor | None) -> tuple[Tensor, Tensor]:
