@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from meshkit.deform.arap import ARAPInfo, Options, check_options, deform, uncompiled
+from meshkit._compile import uncompiled
+from meshkit.deform.arap import ARAPInfo, Options, check_options, deform
 from meshkit.deform.problem import Problem
 from meshkit.deform.topology import check_energy
 
