@@ -681,7 +681,8 @@ def describe(verts: Tensor, faces: Tensor, **options: int) -> Tensor:
     """Wave-kernel signatures of one mesh, then the logarithm of the root of its area."""
     a, b, c = verts[faces].unbind(1)
     area = torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2
-    return torch.cat([wave_kernel_signature(verts, faces, **options), area.sqrt().log().expand(len(verts), 1)], 1)
+    waves = wave_kernel_signature(verts, faces, width=7.0, method="fast", **options)
+    return torch.cat([waves, area.sqrt().log().expand(len(verts), 1)], 1)
 
 
 def test_pool_holds_the_meshes_it_names(pool, humans):

@@ -315,7 +315,7 @@ def test_intrinsic_descriptors_add_the_size(name):
     for scale in (1.0, 3.0):
         value = intrinsic_descriptors(scale * verts, faces, num_signatures=5, num_eigenpairs=20)
         assert value.shape == (len(verts), 6)
-        signature = wave_kernel_signature(verts, faces, num_signatures=5, num_eigenpairs=20)
+        signature = wave_kernel_signature(verts, faces, num_signatures=5, num_eigenpairs=20, width=7.0)
         assert_near(value[:, :5], signature, 1e-6)
         size = torch.full((len(verts),), math.log(scale * math.sqrt(area_literally(verts, faces))), dtype=torch.float64)
         assert_near(value[:, 5], size, 1e-12)
@@ -334,11 +334,11 @@ def test_intrinsic_descriptors_of_a_padded_batch_equal_the_loop(fill):
     assert_near(value[1, :, -1] - value[0, :, -1], torch.full((18,), math.log(2), dtype=torch.float64), 1e-12)
 
 
-def test_intrinsic_descriptors_have_the_defaults_of_the_signature_and_no_gradient():
+def test_intrinsic_descriptors_take_wide_bands_and_have_no_gradient():
     verts, faces = sphere(2, 0.05)
     value = intrinsic_descriptors(verts.float().requires_grad_(), faces)
     assert value.dtype == torch.float32 and not value.requires_grad
-    assert_near(value[:, :-1], wave_kernel_signature(verts.float(), faces), 1e-6)
+    assert_near(value[:, :-1], wave_kernel_signature(verts.float(), faces, width=7.0), 1e-6)
 
 
 # Errors

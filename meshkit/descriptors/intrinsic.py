@@ -17,7 +17,7 @@ def intrinsic_descriptors(
     *,
     num_signatures: int = 16,
     num_eigenpairs: int = 64,
-    width: float = 1.0,
+    width: float = 7.0,
     mask: Tensor | None = None,
     method: str = "exact",
     robust: bool = False,
@@ -33,7 +33,9 @@ def intrinsic_descriptors(
         faces: ``(F, 3)`` int64, or per mesh ``(B, F, 3)``, padding rows -1; ``None`` for point clouds.
         num_signatures: see :func:`wave_kernel_signature`.
         num_eigenpairs: likewise.
-        width: likewise.
+        width: of the wave-kernel bands, in spacings between energies. Wide bands blur, and matching by them alone is
+            worse, yet a network learns far better from them: after 150 steps of ``recipes/xdualnet.py --steps 150 --pool
+            400 --threads 1`` the error is 6.6e-3 with 7 and 19e-3 with 1, which lets it mistake left for right.
         mask: ``(B, V)`` bool, True = real vertex; padded rows come out as 0.
         method: see :func:`laplacian_eigenpairs`; ``"fast"`` is meant for descriptors computed during training.
         robust: likewise.

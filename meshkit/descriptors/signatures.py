@@ -99,7 +99,7 @@ def wave_kernel_signature(
         num_signatures: number of energies. 16 suit a network's input.
         num_eigenpairs: pairs of the Laplacian used, at most V - 1 (fewer are taken on smaller meshes).
         width: of the bands, in spacings between energies. The reference has 7 at 100 energies, about as wide as 1 at
-            16; wider bands at few energies blur, and match surfaces far worse.
+            16; wider bands at few energies blur, and match surfaces by themselves far worse.
         mask: ``(B, V)`` bool, True = real vertex; padded rows come out as 0.
         method: of :func:`laplacian_eigenpairs`. On bodies ``"fast"`` differs from ``"exact"`` by less than a
             tenth of a standard deviation, in half of the time, and matches surfaces as well.
