@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from meshkit.deform.objective import Objective
+from meshkit.deform.objective import Objective, dot
 from meshkit.deform.rest import stationarity_gradient
 from meshkit.deform.rotation import ClosestRotation, RotationDifferential
 
@@ -96,12 +96,12 @@ class _Hessian:
         residual = right.index_select(0, self.factor.free)
         solution = torch.zeros_like(residual)
         direction = objective.solve(residual)
-        square = first = _dot(residual, direction)
+        square = first = dot(residual, direction)
         for iteration in range(500):
             if square <= tol * tol * first:
                 break
             image = self.product(objective.spread(direction)).index_select(0, self.factor.free)
-            curvature = _dot(direction, image)
+            curvature = dot(direction, image)
             if curvature <= 0:
                 # One step with the rotations held fixed is better than none.
                 return objective.spread(solution if iteration else direction), True
@@ -109,10 +109,6 @@ class _Hessian:
             solution.add_(direction, alpha=step)
             residual.sub_(image, alpha=step)
             scaled = objective.solve(residual)
-            before, square = square, _dot(residual, scaled)
+            before, square = square, dot(residual, scaled)
             direction = scaled.add_(direction, alpha=square / before)
         return objective.spread(solution), False
-
-
-def _dot(a: Tensor, b: Tensor) -> float:
-    return float(torch.dot(a.view(-1), b.view(-1)))

@@ -50,7 +50,7 @@ class Objective:
         self.pull: Tensor | None = None
         if factor.soft is not None and soft_targets is not None:
             self.pull = factor.soft[:, None] * soft_targets
-            self.constant += _dot(self.pull, soft_targets)
+            self.constant += dot(self.pull, soft_targets)
         count = len(factor.free)
         self._padded = torch.zeros(count + 1, 3, dtype=torch.float64, device="cpu")
         self._place = torch.full((topology.num_verts,), count, dtype=torch.int32, device="cpu")
@@ -84,7 +84,7 @@ class Objective:
         if self.pull is not None:
             force += self.pull
         image = self.stiffness @ x
-        energy = _dot(x, torch.sub(image, force, alpha=2)) + self.constant
+        energy = dot(x, torch.sub(image, force, alpha=2)) + self.constant
         return energy, image.sub_(force).index_select(0, self.factor.free)
 
     def global_step(self, x: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ class Objective:
 
     def residual(self, energy: float, gradient: Tensor) -> float:
         """Decrease g^T L^-1 g that one local-global iteration is sure to bring, relative."""
-        return self.relative(_dot(gradient, self.solve(gradient)), energy)
+        return self.relative(dot(gradient, self.solve(gradient)), energy)
 
     def relative(self, decrease: float, energy: float) -> float:
         """A decrease over the energy, or over a share of the energy of collapsing the mesh if that is more."""
@@ -121,7 +121,7 @@ def minimise(objective: Objective, x: Tensor, *, max_iter: int, tol: float, refi
     negative = False
     while True:
         direction = _two_loops(objective, history, gradient)
-        decrease = _dot(gradient, direction)
+        decrease = dot(gradient, direction)
         # Without a history this is g^T L^-1 g; with one it knows the curvature too, and is mostly larger.
         residual = objective.relative(decrease, energy)
         if refine and tol < 1e-7 and objective.dtype == torch.float32 and residual <= 1e-7:
@@ -147,7 +147,7 @@ def minimise(objective: Objective, x: Tensor, *, max_iter: int, tol: float, refi
                 break
             continue
         move, change = direction.mul_(-step), new_gradient - gradient
-        curvature = _dot(move, change)
+        curvature = dot(move, change)
         negative = curvature < 0
         if curvature > 0:
             history = [*history[1 - _MEMORY :], (move, change, 1 / curvature)]
@@ -170,15 +170,15 @@ def _two_loops(objective: Objective, history: list[tuple[Tensor, Tensor, float]]
     """The L-BFGS inverse Hessian applied to a gradient."""
     right, shares = gradient.clone(), []
     for move, change, inverse in reversed(history):
-        shares.append(inverse * _dot(move, right))
+        shares.append(inverse * dot(move, right))
         right.sub_(change, alpha=shares[-1])
     direction = objective.solve(right)
     for (move, change, inverse), share in zip(history, reversed(shares), strict=True):
-        direction.add_(move, alpha=share - inverse * _dot(change, direction))
+        direction.add_(move, alpha=share - inverse * dot(change, direction))
     return direction
 
 
-def _dot(a: Tensor, b: Tensor) -> float:
+def dot(a: Tensor, b: Tensor) -> float:
     return float(torch.dot(a.view(-1), b.view(-1)))
 
 

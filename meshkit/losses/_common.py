@@ -23,14 +23,6 @@ def at_least_float32(x: Tensor) -> Tensor:
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
-def safe_sqrt(squared: Tensor) -> Tensor:
-    """Square root with the subgradient 0 at 0; NaN stays NaN."""
-    if not squared.requires_grad:
-        return squared.sqrt()
-    zero = squared == 0
-    return torch.where(zero, 0, torch.where(zero, 1, squared).sqrt())
-
-
 def reduce_samples(total: Tensor, count: Tensor | int, reduction: Reduction) -> Tensor:
     """Reduce the sums (B,) over the real elements of each sample, and the numbers of these elements.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from meshkit._compile import uncompiled
-from meshkit.losses._common import safe_sqrt
+from meshkit._numerics import safe_sqrt
 from meshkit.topology import check_faces
 
 

@@ -5,8 +5,9 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from meshkit._numerics import safe_sqrt
 from meshkit.batching import check_mask, check_verts
-from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples, safe_sqrt
+from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
 from meshkit.neighbors import gather_vertices, knn
 
 __all__ = ["ChamferLoss", "chamfer_loss"]

@@ -48,9 +48,3 @@ def real_faces(faces: Tensor, mask: Tensor | None) -> Tensor:
         return real
     index = faces.clamp_min(0).long().expand(len(mask), *faces.shape[-2:])
     return real & mask.gather(1, index.flatten(1)).view(index.shape).all(-1)
-
-
-def length(squared: Tensor) -> Tensor:
-    """Square root with the subgradient 0 at 0."""
-    zero = squared == 0
-    return torch.where(zero, 0, torch.where(zero, 1, squared).sqrt())

@@ -5,7 +5,8 @@ from typing import Literal, NamedTuple, get_args, overload
 import torch
 from torch import Tensor
 
-from meshkit.metrics._common import check_clouds, common_dtype, length
+from meshkit._numerics import safe_sqrt
+from meshkit.metrics._common import check_clouds, common_dtype
 from meshkit.neighbors import gather_vertices, knn
 
 __all__ = ["ChamferDetails", "chamfer_distance"]
@@ -131,7 +132,7 @@ def _to_nearest(
     if mask is not None:
         difference = torch.where(mask[..., None], difference, 0)
     distance = difference.square().sum(2)
-    return distance if squared else length(distance)
+    return distance if squared else safe_sqrt(distance)
 
 
 def _reduce(distance: Tensor, mask: Tensor | None, point_reduction: str) -> Tensor:

@@ -5,7 +5,8 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from meshkit.metrics._common import check_clouds, common_dtype, length
+from meshkit._numerics import safe_sqrt
+from meshkit.metrics._common import check_clouds, common_dtype
 
 __all__ = ["EarthMoversBounds", "earth_movers_bounds", "earth_movers_distance"]
 
@@ -77,7 +78,7 @@ def earth_movers_distance(
         if _finite(x, y):
             rows, columns, mass = exact_plan(x.detach(), y.detach(), squared)
             distance = (x[rows] - y[columns]).square().sum(1)
-            values.append((mass * (distance if squared else length(distance))).sum())
+            values.append((mass * (distance if squared else safe_sqrt(distance))).sum())
         else:
             values.append((x.sum() + y.sum()) * torch.nan)
     return torch.stack(values)

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from meshkit.metrics._common import check_faces_of, check_pair, common_dtype, length
+from meshkit._numerics import safe_sqrt
+from meshkit.metrics._common import check_faces_of, check_pair, common_dtype
 from meshkit.topology import unique_edges
 
 __all__ = ["edge_ratio"]
@@ -59,4 +60,4 @@ def edge_ratio(
 
 
 def _edge_lengths(verts: Tensor, edges: Tensor) -> Tensor:
-    return length((verts[edges[:, 0]] - verts[edges[:, 1]]).square().sum(1))
+    return safe_sqrt((verts[edges[:, 0]] - verts[edges[:, 1]]).square().sum(1))

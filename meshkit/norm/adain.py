@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from meshkit.batching import masked_mean
-from meshkit.norm.base import ConditionalNorm
+from meshkit.norm.base import ConditionalNorm, check_gate
 from meshkit.norm.modulation import Modulation
 from meshkit.norm.statistics import instance_statistics, zero_padding
 
@@ -191,8 +191,7 @@ class SoftAdaIN(AdaIN):
         self, num_features: int, cond_features: int, *, gate: str | None = "sigmoid", eps: float = 1e-5
     ) -> None:
         super().__init__(num_features, cond_features, eps=eps)
-        if gate not in ("sigmoid", None):
-            raise ValueError(f'gate must be "sigmoid" or None, got {gate!r}')
+        check_gate(gate)
         self.gate = gate
         self.weight = nn.Linear(2 * num_features, num_features)
 

@@ -95,3 +95,8 @@ class ConditionalNorm(nn.Module):
     def modulation(self, cond: Tensor, mean: Tensor, std: Tensor, *, cond_mask: Tensor | None = None) -> Modulation:
         """Scale and shift for a condition whose padded rows are zero, given the statistics of ``x``."""
         raise NotImplementedError(f"{type(self).__name__} must define modulation(cond, mean, std, *, cond_mask=None)")
+
+
+def check_gate(gate: str | None) -> None:
+    if gate not in ("sigmoid", None):
+        raise ValueError(f'gate must be "sigmoid" or None, got {gate!r}')

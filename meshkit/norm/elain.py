@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from meshkit.batching import masked_mean
-from meshkit.norm.base import ConditionalNorm
+from meshkit.norm.base import ConditionalNorm, check_gate
 from meshkit.norm.modulation import Modulation, compose
 from meshkit.norm.statistics import instance_statistics, zero_padding
 
@@ -144,8 +144,3 @@ class ElaIN(ConditionalNorm):
 def check_variant(variant: str) -> None:
     if variant not in OFFSET:
         raise ValueError(f'variant must be "released" or "paper", got {variant!r}')
-
-
-def check_gate(gate: str | None) -> None:
-    if gate not in ("sigmoid", None):
-        raise ValueError(f'gate must be "sigmoid" or None, got {gate!r}')
