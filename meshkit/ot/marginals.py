@@ -33,6 +33,27 @@ class Sides(NamedTuple):
         return self._replace(mu=self.mu.detach(), nu=self.nu.detach())
 
 
+def marginals(
+    a: Tensor | None,
+    b: Tensor | None,
+    mask_x: Tensor | None,
+    mask_y: Tensor | None,
+    shape: tuple[int, int, int],
+    like: Tensor,
+    *,
+    balanced: bool,
+) -> list[Sides]:
+    """Check weights and masks of problems of shape ``(B, N, M)``, and read them sample by sample.
+
+    ``like`` gives dtype and device.
+    """
+    batch, rows, columns = shape
+    mu, nu = weights(a, mask_x, (batch, rows), like.dtype, "x"), weights(b, mask_y, (batch, columns), like.dtype, "y")
+    if balanced and (a is not None or b is not None):
+        check_totals(mu, nu)
+    return [pick(mu, nu, sample, (rows, columns), like) for sample in range(batch)]
+
+
 def pick(mu: Tensor | None, nu: Tensor | None, sample: int, sizes: tuple[int, int], like: Tensor) -> Sides:
     """Weights of one sample and where they are positive. Without mass on either side nothing is left of both."""
     sides: list[tuple[Tensor, Tensor | None]] = []
@@ -55,9 +76,11 @@ def pick(mu: Tensor | None, nu: Tensor | None, sample: int, sizes: tuple[int, in
     return Sides(mu_s, nu_s, index_x, index_y, weight_range)
 
 
-def weights(given: Tensor | None, mask: Tensor | None, like: Tensor, dtype: torch.dtype, side: str) -> Tensor | None:
-    """Weights ``(B, N)`` of the rows of ``like``; ``None`` if all are equal."""
-    batch, size = like.shape[:2]
+def weights(
+    given: Tensor | None, mask: Tensor | None, shape: tuple[int, int], dtype: torch.dtype, side: str
+) -> Tensor | None:
+    """Weights ``(B, N)`` of one side; ``None`` if all are equal."""
+    batch, size = shape
     check_mask(mask, batch, size, name=f"mask_{side}")
     if given is None:
         if mask is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,7 +11,7 @@ from meshkit._compile import uncompiled
 from meshkit.ot.costs import logit_features
 from meshkit.ot.iterations import iterate_kernel, iterate_log
 from meshkit.ot.kernel import GibbsKernel
-from meshkit.ot.marginals import Sides, check_totals, pick, weights
+from meshkit.ot.marginals import Sides, marginals
 from meshkit.ot.options import Cost, Domain, Eps, Grad, Options, Reach, Store, check_choice, read_options
 from meshkit.ot.plan import TransportPlan
 from meshkit.ot.sample import SamplePlan
@@ -108,16 +110,13 @@ def sinkhorn(
     check_features(fx, fy)
     check_choice("cost", cost, Cost)
     options = read_options(eps, n_iters, tol, reach, grad, domain, store)
-    batch, rows, columns = len(fx), fx.shape[1], fy.shape[1]
+    shape = len(fx), fx.shape[1], fy.shape[1]
     dtype = torch.promote_types(torch.promote_types(fx.dtype, fy.dtype), torch.float32)
     with torch.autocast(fx.device.type, enabled=False):
-        mu, nu = weights(a, mask_x, fx, dtype, "x"), weights(b, mask_y, fy, dtype, "y")
-        if not options.unbalanced and (a is not None or b is not None):
-            check_totals(mu, nu)
-        keep = options.keep(batch * rows * columns * dtype.itemsize)
+        like = fx.new_empty(0, dtype=dtype)
+        keep = options.keep(math.prod(shape) * dtype.itemsize)
         samples = []
-        for s in range(batch):
-            sides = pick(mu, nu, s, (rows, columns), fx.new_empty(0, dtype=dtype))
+        for s, sides in enumerate(marginals(a, b, mask_x, mask_y, shape, like, balanced=not options.unbalanced)):
             x, y = sides.rows_of(fx[s].to(dtype)), sides.columns_of(fy[s].to(dtype))
             if check_finite and not bool(x.isfinite().all() & y.isfinite().all()):
                 raise ValueError(f"sample {s} has features that are not finite; mask those vertices or mend them")
@@ -128,7 +127,7 @@ def sinkhorn(
             tiles = feature_tiles(x, y, "none" if not keep else "kernel" if chosen == "kernel" else "logits")
             chosen = "log" if tiles.log_only and len(x) else chosen
             samples.append(solve(GibbsKernel(tiles, x, y), sides, options, chosen, shift))
-        return TransportPlan(samples, (batch, rows, columns))
+        return TransportPlan(samples, shape)
 
 
 def sinkhorn_from_cost(
@@ -193,16 +192,13 @@ def solve_cost(
     """:func:`sinkhorn_from_cost` with options read already; ``start (B, N)`` is the log of the first row scaling."""
     if cost.dim() != 3 or 0 in cost.shape:
         raise ValueError(f"cost must be (B, N, M) with at least one sample, row and column, got {tuple(cost.shape)}")
-    batch, rows, columns = cost.shape
+    shape = cost.shape[0], cost.shape[1], cost.shape[2]
     dtype = torch.promote_types(cost.dtype, torch.float32)
     with torch.autocast(cost.device.type, enabled=False):
-        mu, nu = weights(a, mask_x, cost, dtype, "x"), weights(b, mask_y, cost.mT, dtype, "y")
-        if not options.unbalanced and (a is not None or b is not None):
-            check_totals(mu, nu)
-        keep = options.keep(batch * rows * columns * dtype.itemsize)
+        like = cost.new_empty(0, dtype=dtype)
+        keep = options.keep(math.prod(shape) * dtype.itemsize)
         samples = []
-        for s in range(batch):
-            sides = pick(mu, nu, s, (rows, columns), cost.new_empty(0, dtype=dtype))
+        for s, sides in enumerate(marginals(a, b, mask_x, mask_y, shape, like, balanced=not options.unbalanced)):
             matrix = sides.columns_of(sides.rows_of(cost[s].to(dtype)).mT).mT
             if options.settings.grad == "none":
                 matrix, sides = matrix.detach(), sides.detached()
@@ -213,7 +209,7 @@ def solve_cost(
             first = None if start is None else LOG2_E * sides.rows_of(start[s].to(dtype))
             kernel = GibbsKernel(MatrixTiles(logits, "kernel" if keep and chosen == "kernel" else "none"), logits)
             samples.append(solve(kernel, sides, options, chosen, shift, first))
-        return TransportPlan(samples, (batch, rows, columns))
+        return TransportPlan(samples, shape)
 
 
 def sinkhorn_warp(fx: Tensor, fy: Tensor, values: Tensor, **options: object) -> Tensor:
