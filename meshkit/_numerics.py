@@ -12,3 +12,11 @@ def safe_sqrt(squared: Tensor) -> Tensor:
         return squared.sqrt()
     zero = squared == 0
     return torch.where(zero, 0, torch.where(zero, 1, squared).sqrt())
+
+
+def launch_bound(x: Tensor) -> bool:
+    """Whether an operation costs more to start than to run on a small sample, so that samples are best done together.
+
+    On a CPU it is the other way round: what fits its cache is worth doing by itself.
+    """
+    return x.device.type != "cpu"

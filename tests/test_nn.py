@@ -34,10 +34,13 @@ def extractor_literally(extractor: SetConvExtractor, positions: Tensor, descript
     return literal_setconv.extractor_literally(extractor, positions[None], given)[0]
 
 
-@pytest.fixture(params=[_edge_mlp._CPU_BLOCK, 90], ids=["one-block", "many-blocks"])
-def block(request, monkeypatch) -> int:
-    monkeypatch.setattr(_edge_mlp, "_CPU_BLOCK", request.param)
-    return request.param
+@pytest.fixture(params=[_edge_mlp._CPU_BLOCK, 90, None], ids=["one-block", "many-blocks", "samples-together"])
+def block(request, monkeypatch) -> None:
+    """How the rows are gone through; samples go together on devices other than the CPU."""
+    if request.param is None:
+        monkeypatch.setattr(_edge_mlp, "launch_bound", lambda x: True)
+    else:
+        monkeypatch.setattr(_edge_mlp, "_CPU_BLOCK", request.param)
 
 
 recompute = pytest.mark.parametrize("recompute", [False, True], ids=["kept", "recomputed"])

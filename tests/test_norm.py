@@ -61,6 +61,12 @@ def elain_literally(p: dict[str, Tensor], x: Tensor, cond: Tensor, variant: str)
     return ((offset + gamma) * ((h_warp - mu) / sigma) + beta)[0].T
 
 
+@pytest.fixture(params=[False, True], ids=["in-tiles", "samples-together"])
+def walk(request, monkeypatch) -> None:
+    """How the vertices are gone through: the whole batch at once on devices other than the CPU."""
+    monkeypatch.setattr(_tiles, "launch_bound", lambda x: request.param)
+
+
 # ElaIN
 
 
@@ -104,7 +110,7 @@ def test_gradcheck(variant):
 
 @variants
 @pytest.mark.parametrize("garbage", GARBAGE)
-def test_padded_batch_equals_the_loop(garbage, variant):
+def test_padded_batch_equals_the_loop(garbage, variant, walk):
     norm, sizes = make(variant), [5, 9, 1]
     xs, conds = ([rand(n, c, seed=i + s).requires_grad_() for i, n in enumerate(sizes)] for c, s in ((C, 0), (D, 9)))
     mask = scattered_mask(sizes, 12)
@@ -188,7 +194,7 @@ def test_eps_is_added_to_the_variance(variant):
 
 @variants
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_autocast(variant, dtype):
+def test_autocast(variant, dtype, walk):
     norm = make(variant, dtype=torch.float32)
     x, cond = rand(2, 40, C, dtype=dtype), rand(2, 40, D, seed=1, dtype=dtype)
     with torch.autocast("cpu", torch.bfloat16):
@@ -511,8 +517,9 @@ forms = pytest.mark.parametrize(
 
 
 @forms
-@pytest.mark.parametrize("rows", [4, 11, 512])
+@pytest.mark.parametrize("rows", [4, 11, 512, None])
 def test_modulate_in_tiles_of_any_size(features, linear, slope, rows, monkeypatch):
+    monkeypatch.setattr(_tiles, "launch_bound", lambda x: rows is None)
     monkeypatch.setattr(_tiles, "ROWS", rows)
     inputs = modulation_inputs(features, linear)
     value, expected = call_modulate(slope, *inputs), modulate_literally(slope, *inputs)
@@ -550,7 +557,7 @@ def test_modulate_without_bias():
     assert_near(call_modulate(0.2, *inputs), modulate_literally(0.2, *inputs), 1e-13)
 
 
-def test_modulate_in_half_precision():
+def test_modulate_in_half_precision(walk):
     inputs = [t.detach().requires_grad_() for t in modulation_inputs(True, True, num=40)]
     x, mean, scale, shift, *others = inputs
     low = [t.detach().bfloat16() for t in (x,)] + [t.detach().float() for t in (mean, scale, shift)]
@@ -596,7 +603,7 @@ def test_statistics_are_those_of_instance_norm():
 
 @pytest.mark.parametrize("unbiased", [False, True])
 @pytest.mark.parametrize("garbage", GARBAGE)
-def test_masked_statistics_equal_the_loop(garbage, unbiased):
+def test_masked_statistics_equal_the_loop(garbage, unbiased, walk):
     samples, mask = [rand(n, 3, seed=n) for n in (4, 7, 1)], scattered_mask([4, 7, 1], 9)
     x = scatter(samples, mask, garbage).requires_grad_()
     result = instance_statistics(x, mask=mask, unbiased=unbiased)

@@ -18,6 +18,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import leaky_relu
 
+from meshkit._numerics import launch_bound
+
 __all__ = ["EPS", "edge_mlp"]
 
 EPS = 1e-5  # of the instance norms
@@ -64,13 +66,15 @@ def _run_forward(*inputs: Any) -> tuple[Tensor, ...]:
     u, v, w2, scale2, shift2, w3, neighbors, mask, slope, recompute, keep, dtype = inputs
     batch, num, channels = u.shape
     best, state = torch.zeros_like(u), u.new_empty(batch, 4, channels)
-    kept = u.new_empty(batch if keep else 0 if recompute else 1, num * neighbors.shape[2], channels, dtype=dtype)
+    groups = list(_groups(neighbors, mask, channels))
+    room = batch if keep else 0 if recompute else max((len(state[b]) for b, _, _ in groups), default=0)
+    kept = u.new_empty(room, num * neighbors.shape[2], channels, dtype=dtype)
     with torch.autocast(u.device.type, enabled=False):
-        for b, real, nearest in _samples(neighbors, mask):
+        for b, real, nearest in groups:
             rows = _Rows(u[b, real], v[b, real], w2, w3, nearest, slope, dtype)
-            z2 = None if recompute else kept[b if keep else 0, : nearest.numel()]
+            z2 = None if recompute else kept[b if keep else slice(0, rows.groups), : rows.size].flatten(0, 1)
             best[b, real], *vectors = _forward(rows, scale2, shift2, z2)
-            state[b] = torch.stack(vectors)
+            state[b] = torch.cat(vectors, 1)
     return best, state[:, 0].clone(), state[:, 1].clone(), state, kept if keep else kept.new_empty(0)
 
 
@@ -79,12 +83,12 @@ def _run_backward(*inputs: Any) -> tuple[Tensor, ...]:
     grad_u, grad_v = torch.zeros_like(u), torch.zeros_like(v)
     shared = [torch.zeros_like(t, dtype=u.dtype) for t in (w2, scale2, shift2, w3)]
     with torch.autocast(u.device.type, enabled=False):
-        for b, real, nearest in _samples(neighbors, mask):
+        for b, real, nearest in _groups(neighbors, mask, u.shape[2]):
             rows = _Rows(u[b, real], v[b, real], w2, w3, nearest, slope, kept.dtype)
-            z2 = kept[b, : nearest.numel()] if kept.numel() else None
-            grad_best, grad_mean, grad_variance = (grad[b] for grad in grads)
+            z2 = kept[b, : rows.size].flatten(0, 1) if kept.numel() else None
+            grad_best, grad_mean, grad_variance = grads[0][b, real], grads[1][b, None], grads[2][b, None]
             grad_u[b, real], grad_v[b, real], *rest = _backward(
-                rows, scale2, shift2, state[b], z2, grad_best[real], grad_mean, grad_variance
+                rows, scale2, shift2, state[b], z2, grad_best, grad_mean, grad_variance
             )
             for total, gradient in zip(shared, rest, strict=True):
                 total += gradient
@@ -152,44 +156,72 @@ class _EdgeMLP(torch.autograd.Function):
         return *results, None, None, None, None, None, None
 
 
-def _samples(neighbors: Tensor, mask: Tensor | None) -> Iterator[tuple[int, Tensor | slice, Tensor]]:
-    """Index of each sample, its real vertices, and the neighbours numbered among these."""
-    for b, nearest in enumerate(neighbors):
+def _groups(
+    neighbors: Tensor, mask: Tensor | None, channels: int
+) -> Iterator[tuple[slice, Tensor | slice, Tensor]]:
+    """Samples to go through together, their real vertices, and the neighbours ``(G, n, k)`` numbered among these.
+
+    Together where a launch costs more than a pass over the rows: off the CPU, as long as they are few. With a mask the
+    samples differ in size, and each is a group.
+    """
+    batch = len(neighbors)
+    together = launch_bound(neighbors) and mask is None and neighbors.numel() * channels <= _OTHER_BLOCK
+    if together and batch:
+        yield slice(None), slice(None), neighbors
+        return
+    for b in range(batch):
+        one = slice(b, b + 1)
         if mask is None:
-            yield b, slice(None), nearest
+            yield one, slice(None), neighbors[one]
         else:
             real = mask[b].nonzero()[:, 0]
-            yield b, real, (mask[b].cumsum(0) - 1)[nearest[real]]
+            yield one, real, (mask[b].cumsum(0) - 1)[neighbors[b, real]][None]
 
 
 class _Rows:
-    """The rows of one sample, made a block at a time."""
+    """The rows of a group of samples, made a block of vertices at a time; as matrices ``(G n k, C)``."""
 
     def __init__(
         self, u: Tensor, v: Tensor, w2: Tensor, w3: Tensor, nearest: Tensor, slope: float, dtype: torch.dtype
     ) -> None:
         self.u, self.v, self.nearest, self.slope = u, v, nearest, slope
         self.w2, self.w3 = w2.to(dtype), w3.to(dtype)
-        (self.num, self.k), self.channels = nearest.shape, u.shape[1]
-        self.size = self.num * self.k
+        (self.groups, self.num, self.k), self.channels = nearest.shape, u.shape[2]
+        self.size = self.num * self.k  # rows of one sample
+        if self.groups > 1:  # number the vertices through
+            first = self.num * torch.arange(self.groups, device=nearest.device)
+            self.nearest = nearest + first[:, None, None]
 
     def blocks(self) -> Iterator[tuple[slice, slice]]:
-        """Slices of the vertices, and of their rows."""
+        """Slices of the vertices of each sample, and of the group's rows."""
         elements = _CPU_BLOCK if self.u.device.type == "cpu" else _OTHER_BLOCK
-        step = max(1, elements // (self.k * self.channels))
+        step = max(1, elements // (self.k * self.channels)) if self.groups == 1 else max(1, self.num)
         for start in range(0, self.num, step):
             stop = min(start + step, self.num)
-            yield slice(start, stop), slice(start * self.k, stop * self.k)
+            yield slice(start, stop), slice(start * self.k, stop * self.k if self.groups == 1 else None)
+
+    def per_sample(self, rows: Tensor) -> Tensor:
+        """``(G, n k, C)``."""
+        return rows.view(self.groups, -1, self.channels)
+
+    def per_vertex(self, rows: Tensor) -> Tensor:
+        """``(G, n, k, C)``."""
+        return rows.view(self.groups, -1, self.k, self.channels)
+
+    def neighbors(self, vertices: slice) -> Tensor:
+        """The vertex of each row."""
+        return self.nearest[:, vertices].flatten()
 
     def first(self, vertices: slice) -> Tensor:
         """h_1."""
-        nearest = self.nearest[vertices]
-        h = self.u.index_select(0, nearest.flatten()).view(*nearest.shape, -1).sub_(self.v[vertices, None])
-        return leaky_relu(h, self.slope, inplace=True).flatten(0, 1).to(self.w2)
+        h = self.u.flatten(0, 1).index_select(0, self.neighbors(vertices))
+        self.per_vertex(h).sub_(self.v[:, vertices, None])
+        return leaky_relu(h, self.slope, inplace=True).to(self.w2)
 
     def second(self, z2: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
         """h_2."""
-        return leaky_relu(torch.addcmul(shift.to(z2), z2, scale.to(z2)), self.slope, inplace=True)
+        normed = torch.addcmul(shift.to(z2), self.per_sample(z2), scale.to(z2))
+        return leaky_relu(normed, self.slope, inplace=True).flatten(0, 1)
 
     def through(self, gradient: Tensor, h: Tensor) -> Tensor:
         """The gradient before the activation whose result is h, in place."""
@@ -197,38 +229,45 @@ class _Rows:
 
 
 class _Moments:
-    """Mean and variance of rows that come in blocks, each about its own mean, so that no large squares cancel."""
+    """Mean and variance ``(G, 1, C)`` of rows that come in blocks ``(G, R, C)``.
+
+    Each block about its own mean, so that no large squares cancel.
+    """
 
     def __init__(self, dtype: torch.dtype) -> None:
         self.size, self.dtype = 0, dtype
 
     def add(self, rows: Tensor) -> None:
-        mean, size = rows.mean(0, dtype=self.dtype), self.size
-        squares = (rows - mean).square_().sum(0)
-        self.size += len(rows)
+        mean, size, more = rows.mean(1, keepdim=True, dtype=self.dtype), self.size, rows.shape[1]
+        squares = (rows - mean).square_().sum(1, keepdim=True)
+        self.size += more
         if not size:
             self.mean, self.squares = mean, squares
             return
         # In place: small tensors that outlive their block would fragment the memory of the large ones.
         difference = mean - self.mean
-        self.mean += difference * (len(rows) / self.size)
-        self.squares += squares + difference.square() * (size * len(rows) / self.size)
+        self.mean += difference * (more / self.size)
+        self.squares += squares + difference.square() * (size * more / self.size)
 
     def variance(self) -> Tensor:
         return self.squares / self.size
 
 
 def _forward(rows: _Rows, scale2: Tensor, shift2: Tensor, kept: Tensor | None) -> tuple[Tensor, ...]:
-    """The maximum, mean and variance of z_3, and the mean and variance of z_2. Fills ``kept`` with z_2."""
+    """The maximum ``(G, n, C)``, mean and variance ``(G, 1, C)`` of z_3, mean and variance of z_2.
+
+    Fills ``kept`` with z_2.
+    """
     second, third, best = _Moments(rows.u.dtype), _Moments(rows.u.dtype), torch.empty_like(rows.u)
     for vertices, block in rows.blocks():
-        second.add(torch.mm(rows.first(vertices), rows.w2.mT, out=None if kept is None else kept[block]))
+        z2 = torch.mm(rows.first(vertices), rows.w2.mT, out=None if kept is None else kept[block])
+        second.add(rows.per_sample(z2))
     scale, shift = _affine(scale2, shift2, second.mean, second.variance())
     for vertices, block in rows.blocks():
         z2 = rows.first(vertices) @ rows.w2.mT if kept is None else kept[block]
         z3 = rows.second(z2, scale, shift) @ rows.w3.mT
-        third.add(z3)
-        best[vertices] = z3.view(-1, rows.k, rows.channels).amax(1)
+        third.add(rows.per_sample(z3))
+        best[:, vertices] = rows.per_vertex(z3).amax(2)
     return best, third.mean, third.variance(), second.mean, second.variance()
 
 
@@ -242,21 +281,21 @@ def _backward(
     grad_mean: Tensor,
     grad_variance: Tensor,
 ) -> tuple[Tensor, ...]:
-    """Gradients with respect to u, v, w2, scale2, shift2, w3."""
-    mean3, _, mean2, variance2 = state
+    """Gradients with respect to u, v, w2, scale2, shift2, w3; ``state`` is what the forward pass found."""
+    mean3, _, mean2, variance2 = state.split(1, 1)
     scale, shift = _affine(scale2, shift2, mean2, variance2)
     # dL/dz_3 is slope3 z_3 + constant3, and grad_best more at the maximum.
     slope3 = 2 * grad_variance / rows.size
     constant3 = grad_mean / rows.size - slope3 * mean3
-    slope3, constant3, grad_best = (t.to(rows.w2) for t in (slope3, constant3, grad_best))
+    slope3, constant3, grad_best = (t.to(rows.w2)[:, :, None] for t in (slope3, constant3, grad_best))
 
     def upper(vertices: slice, z2: Tensor, out: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """h_2, dL/dz_3 and dL/d(a z_2 + b) of a block."""
         h2 = rows.second(z2, scale, shift)
-        z3 = (h2 @ rows.w3.mT).view(-1, rows.k, rows.channels)
-        below = (z3 - z3.amax(1, keepdim=True)).sign_()  # 0 at the maximum, else -1
-        share = grad_best[vertices, None] / (below.sum(1, keepdim=True) + rows.k)  # equal maxima share the gradient
-        grad3 = torch.addcmul(constant3 + share, z3, slope3).addcmul_(below, share).flatten(0, 1)
+        z3 = rows.per_vertex(h2 @ rows.w3.mT)
+        below = (z3 - z3.amax(2, keepdim=True)).sign_()  # 0 at the maximum, else -1
+        share = grad_best[:, vertices] / (below.sum(2, keepdim=True) + rows.k)  # equal maxima share the gradient
+        grad3 = torch.addcmul(constant3 + share, z3, slope3).addcmul_(below, share).flatten(0, 2)
         return h2, grad3, rows.through(torch.mm(grad3, rows.w3, out=out), h2)
 
     stored = None if kept is None else torch.empty_like(kept)
@@ -266,8 +305,8 @@ def _backward(
         z2 = rows.first(vertices) @ rows.w2.mT if kept is None else kept[block]
         h2, grad3, grad2 = upper(vertices, z2, None if stored is None else stored[block])
         grad_w3 += grad3.mT @ h2
-        total += grad2.sum(0, dtype=total.dtype)
-        against += (grad2 * z2).sum(0, dtype=total.dtype)
+        total += rows.per_sample(grad2).sum(1, keepdim=True, dtype=total.dtype)
+        against += rows.per_sample(grad2 * z2).sum(1, keepdim=True, dtype=total.dtype)
 
     inverse = (variance2 + EPS).rsqrt()
     grad_scale = inverse * (against - mean2 * total)
@@ -280,12 +319,13 @@ def _backward(
         h1 = rows.first(vertices)
         z2 = h1 @ rows.w2.mT if kept is None else kept[block]
         grad2 = upper(vertices, z2)[2] if stored is None else stored[block]
-        grad2 = torch.addcmul(constant2, z2, slope2).addcmul_(grad2, scale)
+        grad2 = torch.addcmul(constant2, rows.per_sample(z2), slope2).addcmul_(rows.per_sample(grad2), scale)
+        grad2 = grad2.flatten(0, 1)
         grad_w2 += grad2.mT @ h1
         grad1 = rows.through(grad2 @ rows.w2, h1).to(grad_u)
-        grad_u.index_add_(0, rows.nearest[vertices].flatten(), grad1)
-        grad_v[vertices] = grad1.view(-1, rows.k, rows.channels).sum(1)
-    return grad_u, grad_v.neg_(), grad_w2, grad_scale, total, grad_w3
+        grad_u.flatten(0, 1).index_add_(0, rows.neighbors(vertices), grad1)
+        grad_v[:, vertices] = rows.per_vertex(grad1).sum(2)
+    return grad_u, grad_v.neg_(), grad_w2, grad_scale.sum((0, 1)), total.sum((0, 1)), grad_w3
 
 
 def _affine(scale: Tensor, shift: Tensor, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:

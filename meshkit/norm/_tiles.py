@@ -7,25 +7,34 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from meshkit._numerics import launch_bound
+
 ROWS = 512  # of a tile on a CPU: a few tiles of 1024 float32 channels stay in the cache between passes
 
 
-def tiles(x: Tensor) -> Iterator[tuple[int, slice]]:
-    """Sample and rows of each tile of ``x (B, N, C)``."""
-    rows = _rows(x)
+def tiles(x: Tensor) -> Iterator[tuple[int | slice, slice]]:
+    """Samples and rows of each tile of ``x (B, N, C)``.
+
+    On a CPU a tile is some rows of one sample, ``(R, C)``. Elsewhere each operation costs a launch and there is no
+    cache to stay in: the only tile is the batch, ``(B, N, C)``.
+    """
+    if launch_bound(x):
+        yield slice(None), slice(None)
+        return
     for sample in range(len(x)):
-        for start in range(0, x.shape[1], rows):
-            yield sample, slice(start, min(start + rows, x.shape[1]))
+        for start in range(0, x.shape[1], ROWS):
+            yield sample, slice(start, min(start + ROWS, x.shape[1]))
 
 
 def tile_buffer(x: Tensor, dtype: torch.dtype) -> Tensor:
     """Room for one tile, to be used for all of them: fresh memory costs as much as a pass over it."""
-    return torch.empty(_rows(x), x.shape[2], dtype=dtype, device=x.device)
+    shape = x.shape if launch_bound(x) else (min(ROWS, x.shape[1]), x.shape[2])
+    return torch.empty(shape, dtype=dtype, device=x.device)
 
 
-def _rows(x: Tensor) -> int:
-    """Rows of a tile; other devices than CPUs gain nothing from splitting a sample."""
-    return min(ROWS, x.shape[1]) if x.device.type == "cpu" else x.shape[1]
+def fill(buffer: Tensor, x: Tensor) -> Tensor:
+    """The part of a tile's buffer that a tile as large as ``x`` takes."""
+    return buffer[: len(x)]
 
 
 def traced() -> bool:

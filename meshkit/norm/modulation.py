@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, linear
 
-from meshkit.norm._tiles import tile_buffer, tiles, traced
+from meshkit.norm._tiles import fill, tile_buffer, tiles, traced
 
 __all__ = ["Modulation", "modulate"]
 
@@ -130,9 +130,9 @@ class _Modulate(torch.autograd.Function):
             if weight is None:
                 out[b, rows] = y
             elif bias is None:
-                torch.mm(y.to(dtype), weight.mT, out=out[b, rows])
+                torch.mm(_flat(y.to(dtype)), weight.mT, out=_flat(out[b, rows]))
             else:
-                torch.addmm(bias, y.to(dtype), weight.mT, out=out[b, rows])
+                torch.addmm(bias, _flat(y.to(dtype)), weight.mT, out=_flat(out[b, rows]))
         return out
 
     @staticmethod
@@ -159,15 +159,15 @@ class _Modulate(torch.autograd.Function):
             y, centred, scale = _activated(b, rows, buffers, ctx.slope, *normed)
             g = grad[b, rows]
             if grad_weight is not None:
-                _accumulate(grad_weight, g.mT, y.to(weight.dtype))
+                _accumulate(grad_weight, _flat(g).mT, _flat(y.to(weight.dtype)))
             if weight is not None:
                 g = (g @ weight).to(y.dtype)
             if ctx.slope is not None:  # True: y is the result of the activation, not its input
                 g = torch.ops.aten.leaky_relu_backward(g, y, ctx.slope, True, grad_input=y)
             torch.mul(g, scale, out=grad_x[b, rows])
             g_scale = centred.mul_(g)
-            grad_scale[b] += g_scale.sum(0)
-            grad_shift[b] += g.sum(0)
+            grad_scale[b] += g_scale.sum(-2, keepdim=True)
+            grad_shift[b] += g.sum(-2, keepdim=True)
             if features is not None:
                 f, g_scale, g = features[b, rows], g_scale.to(features.dtype), g.to(features.dtype)
                 if grad_scale_weight is not None:
@@ -175,8 +175,8 @@ class _Modulate(torch.autograd.Function):
                 if grad_shift_weight is not None:
                     _accumulate(grad_shift_weight[b], f.mT, g)
                 if grad_features is not None:
-                    torch.mm(g_scale, scale_weight[b].mT, out=grad_features[b, rows])
-                    grad_features[b, rows].addmm_(g, shift_weight[b].mT)
+                    torch.matmul(g_scale, scale_weight[b].mT, out=grad_features[b, rows])
+                    _accumulate(grad_features[b, rows], g, shift_weight[b].mT)
         # The mean enters as x - mean, so its gradient is that of x summed.
         grad_mean = -grad_x.sum(1, keepdim=True, dtype=mean.dtype)
         grad_bias = grad.sum((0, 1)) if needed[8] else None
@@ -189,7 +189,7 @@ class _Modulate(torch.autograd.Function):
 
 
 def _activated(
-    b: int,
+    b: int | slice,
     rows: slice,
     buffers: Sequence[Tensor],
     slope: float | None,
@@ -203,7 +203,7 @@ def _activated(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One tile of the activated features, the centred ones and the scale; the first two may share a buffer."""
     x = x[b, rows]
-    y, centred, scale, shift = (buffer[: len(x)] for buffer in buffers)
+    y, centred, scale, shift = (fill(buffer, x) for buffer in buffers)
     if features is None or scale_weight is None or shift_weight is None:
         scale, shift = scale_bias[b], shift_bias[b]
     else:
@@ -219,7 +219,7 @@ def _activated(
 def _affine(features: Tensor, weight: Tensor, bias: Tensor, *, out: Tensor) -> None:
     """``features @ weight + bias``; only the product may be in half precision."""
     if features.dtype == out.dtype:
-        torch.addmm(bias, features, weight, out=out)
+        (torch.addmm if out.dim() == 2 else torch.baddbmm)(bias, features, weight, out=out)
     else:
         torch.add(features @ weight, bias, out=out)
 
@@ -227,9 +227,14 @@ def _affine(features: Tensor, weight: Tensor, bias: Tensor, *, out: Tensor) -> N
 def _accumulate(total: Tensor, a: Tensor, b: Tensor) -> None:
     """Add ``a @ b``; only the product may be in half precision."""
     if total.dtype == a.dtype:
-        total.addmm_(a, b)
+        (total.addmm_ if total.dim() == 2 else total.baddbmm_)(a, b)
     else:
         total.add_(a @ b)
+
+
+def _flat(tile: Tensor) -> Tensor:
+    """The rows of a tile that may span samples."""
+    return tile.flatten(0, -2)
 
 
 def _differentiable_gradients(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:

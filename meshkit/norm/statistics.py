@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from meshkit.batching import check_mask, masked_mean
-from meshkit.norm._tiles import tile_buffer, tiles, traced
+from meshkit.norm._tiles import fill, tile_buffer, tiles, traced
 
 __all__ = ["instance_norm", "instance_statistics"]
 
@@ -101,10 +101,10 @@ class _Moments(torch.autograd.Function):
         mean = masked_mean(x, mask)[:, None]
         squares, work = torch.zeros_like(mean), tile_buffer(x, x.dtype)
         for b, rows in tiles(x):
-            centred = torch.sub(x[b, rows], mean[b], out=work[: rows.stop - rows.start])
+            centred = torch.sub(x[b, rows], mean[b], out=fill(work, x[b, rows]))
             if mask is not None:
                 centred.masked_fill_(~mask[b, rows, None], 0.0)
-            squares[b] += centred.square_().sum(0)
+            squares[b] += centred.square_().sum(-2, keepdim=True)
         return mean, squares / _count(x, mask)
 
     @staticmethod
@@ -121,7 +121,7 @@ class _Moments(torch.autograd.Function):
         offset, gain = grad_mean / count, 2 * grad_variance / count
         grad, work = torch.empty_like(x), tile_buffer(x, x.dtype)
         for b, rows in tiles(x):
-            centred = torch.sub(x[b, rows], mean[b], out=work[: rows.stop - rows.start])
+            centred = torch.sub(x[b, rows], mean[b], out=fill(work, x[b, rows]))
             tile = torch.addcmul(offset[b], centred, gain[b], out=grad[b, rows])
             if mask is not None:
                 tile.masked_fill_(~mask[b, rows, None], 0.0)
