@@ -156,9 +156,7 @@ class _EdgeMLP(torch.autograd.Function):
         return *results, None, None, None, None, None, None
 
 
-def _groups(
-    neighbors: Tensor, mask: Tensor | None, channels: int
-) -> Iterator[tuple[slice, Tensor | slice, Tensor]]:
+def _groups(neighbors: Tensor, mask: Tensor | None, channels: int) -> Iterator[tuple[slice, Tensor | slice, Tensor]]:
     """Samples to go through together, their real vertices, and the neighbours ``(G, n, k)`` numbered among these.
 
     Together where a launch costs more than a pass over the rows: off the CPU, as long as they are few. With a mask the

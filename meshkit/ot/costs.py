@@ -27,7 +27,7 @@ def logit_features(
         x, y = unit(x), unit(y)
         if not constant:
             # The smaller side is scaled, since that takes a copy.
-            x, y = (x, y * rate) if len(x) > len(y) else (x * rate, y)
+            x, y = (x, y * rate) if x.shape[-2] > y.shape[-2] else (x * rate, y)
             return x, y, 2 / value, 1.0
         x = torch.cat([x, -torch.ones_like(x[:, :1])], 1) * rate
         return x, torch.cat([y, y.new_ones(len(y), 1)], 1), 2 / value, 0.0
@@ -57,11 +57,11 @@ class _Unit(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         # Divided by its largest entry first, a row's norm neither over- nor underflows.
-        largest = x.abs().amax(1, keepdim=True)
+        largest = x.abs().amax(-1, keepdim=True)
         alive = largest > 0
         largest = torch.where(alive, largest, 1.0)
         y = x / largest
-        inverse = torch.where(alive, y.square().sum(1, keepdim=True).rsqrt(), 0.0)
+        inverse = torch.where(alive, y.square().sum(-1, keepdim=True).rsqrt(), 0.0)
         y *= inverse
         ctx.save_for_backward(y, inverse / largest)
         return y
@@ -70,5 +70,5 @@ class _Unit(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         refuse_second_derivative()
         y, inverse = ctx.saved_tensors
-        along = (gradient * y).sum(1, keepdim=True)
+        along = (gradient * y).sum(-1, keepdim=True)
         return torch.addcmul(gradient, y, along, value=-1).mul_(inverse)

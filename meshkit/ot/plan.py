@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from meshkit._compile import uncompiled
 from meshkit.ot.sample import SamplePlan, pad_columns, spread
+from meshkit.ot.stacked import split
 
 __all__ = ["TransportPlan"]
 
@@ -32,10 +34,21 @@ class TransportPlan:
         tensor([2., 3., 1.])
     """
 
-    def __init__(self, samples: Sequence[SamplePlan], shape: tuple[int, int, int], *, transposed: bool = False) -> None:
-        self._samples = samples
+    def __init__(
+        self, samples: Sequence[SamplePlan] | SamplePlan, shape: tuple[int, int, int], *, transposed: bool = False
+    ) -> None:
+        self._given = samples
         self._shape = shape
         self._transposed = transposed
+
+    @cached_property
+    def _samples(self) -> Sequence[SamplePlan]:
+        return split(self._given) if isinstance(self._given, SamplePlan) else self._given
+
+    @property
+    def _any(self) -> SamplePlan:
+        """A sample, or all of them: what tells dtype and settings."""
+        return self._given if isinstance(self._given, SamplePlan) else self._given[0]
 
     @property
     def shape(self) -> torch.Size:
@@ -45,34 +58,36 @@ class TransportPlan:
 
     def __repr__(self) -> str:
         """Shape, type and regularisation."""
-        eps = float(torch.as_tensor(self._samples[0].eps).detach())
+        eps = float(torch.as_tensor(self._any.eps).detach())
         return f"TransportPlan(shape={tuple(self.shape)}, dtype={self.dtype}, eps={eps:g}, n_iters={self.n_iters})"
 
     @property
     def dtype(self) -> torch.dtype:
         """Of all values, float32 or float64."""
-        return self._samples[0].mu.dtype
+        return self._any.mu.dtype
 
     @property
     def device(self) -> torch.device:
         """Of all values."""
-        return self._samples[0].mu.device
+        return self._any.mu.device
 
     @property
     def T(self) -> TransportPlan:
         """The transposed plan; ``plan.T @ values`` carries values from rows to columns."""
-        return TransportPlan(self._samples, self._shape, transposed=not self._transposed)
+        return TransportPlan(self._given, self._shape, transposed=not self._transposed)
 
     @property
     def n_iters(self) -> list[int]:
         """Iterations done for each sample; fewer than allowed where ``tol`` was reached."""
-        return [sample.n_iters for sample in self._samples]
+        if isinstance(self._given, SamplePlan):
+            return [self._given.n_iters] * self._shape[0]
+        return [sample.n_iters for sample in self._given]
 
     def __matmul__(self, values: Tensor) -> Tensor:
         """``T @ values`` for ``values`` of shape ``(B, M, C)``: ``(B, N, C)``. Each row holds its mass times a mean."""
         values = self._checked(values)
         if self._transposed:
-            return self._per_row(lambda s, v: s.b[:, None] * s.columns(v), values)
+            return self._per_row(lambda s, v: s.b[..., None] * s.columns(v), values)
         return self._per_row(lambda s, v: s.product(v), values)
 
     def barycentric(self, values: Tensor) -> Tensor:
@@ -89,8 +104,8 @@ class TransportPlan:
 
         def warp(sample: SamplePlan, values: Tensor) -> Tensor:
             if self._transposed:
-                product = sample.columns(torch.cat([values, values.new_ones(len(values), 1)], 1))
-                product, mass = product[:, :-1], product[:, -1:]
+                product = sample.columns(torch.cat([values, values.new_ones(*values.shape[:-1], 1)], -1))
+                product, mass = product[..., :-1], product[..., -1:]
             else:
                 product, mass = sample.rows(values)
             starved = mass <= 0
@@ -202,7 +217,7 @@ class TransportPlan:
                 matched = torch.where(matched < 0, -1, positions.cpu()[matched])
             return matched.to(self.device)
 
-        return self._per_row(solve, empty=-1)
+        return self._spread([solve(sample) for sample in self._samples], over_rows=not self._transposed, empty=-1)
 
     def dense(self) -> Tensor:
         """The matrix itself, ``(B, N, M)``."""
@@ -234,6 +249,8 @@ class TransportPlan:
         """Read each sample, and spread what it says of its rows over the padded rows; ``values`` belong to columns."""
         result = []
         with torch.autocast(self.device.type, enabled=False):
+            if isinstance(self._given, SamplePlan):
+                return read(self._given) if values is None else read(self._given, values)
             for b, sample in enumerate(self._samples):
                 columns = sample.index_x if self._transposed else sample.index_y
                 arguments = []

@@ -15,6 +15,8 @@ from meshkit.ot.tiles import LOG2_E, Reference
 class SamplePlan:
     """The plan of one sample, over its rows and columns of positive weight.
 
+    Also of several samples of one size: everything then has a leading batch dimension (see :mod:`meshkit.ot.stacked`).
+
     Args:
         kernel: of the sample.
         mu: ``(N,)`` row weights.
@@ -44,21 +46,22 @@ class SamplePlan:
 
     def rows(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """``K (b v)`` and ``K b`` in one sweep."""
-        product = self.kernel.apply(torch.cat([self.b[:, None] * values, self.b[:, None]], 1), self.reference)
+        b = self.b[..., None]
+        product = self.kernel.apply(torch.cat([b * values, b], -1), self.reference)
         if not values.requires_grad:  # else the cached sums would hold on to the graph of the values
-            self._remember(product[:, -1])
-        return product[:, :-1], product[:, -1:]
+            self._remember(product[..., -1])
+        return product[..., :-1], product[..., -1:]
 
     def columns(self, values: Tensor) -> Tensor:
         """``Kᵀ (a v)``."""
-        return self.kernel.apply(self.a[:, None] * values, self.reference, transpose=True)
+        return self.kernel.apply(self.a[..., None] * values, self.reference, transpose=True)
 
     @property
     def sums(self) -> Tensor:
         """``K b``, ``(N,)``."""
         if self._sums is not None and (self._sums.requires_grad or not self._tracked()):
             return self._sums
-        sums = self.kernel.apply(self.b[:, None], self.reference)[:, 0]
+        sums = self.kernel.apply(self.b[..., None], self.reference)[..., 0]
         self._remember(sums)
         return sums
 
@@ -84,7 +87,7 @@ class SamplePlan:
     def product(self, values: Tensor) -> Tensor:
         """``T v``."""
         product, sums = self.rows(values)
-        return self.scaling(sums[:, 0])[:, None] * product
+        return self.scaling(sums[..., 0])[..., None] * product
 
     def row_mass(self) -> Tensor:
         """Row sums ``(N,)``."""
@@ -92,7 +95,7 @@ class SamplePlan:
 
     def column_mass(self) -> Tensor:
         """Column sums ``(M,)``."""
-        return self.b * self.columns(self.mu.new_ones(len(self.mu), 1))[:, 0]
+        return self.b * self.columns(torch.ones_like(self.mu)[..., None])[..., 0]
 
     def logarithms(self) -> tuple[Tensor, Tensor]:
         """Natural logarithms of both scalings."""

@@ -15,6 +15,7 @@ from meshkit.ot.marginals import Sides, marginals
 from meshkit.ot.options import Cost, Domain, Eps, Grad, Options, Reach, Store, check_choice, read_options
 from meshkit.ot.plan import TransportPlan
 from meshkit.ot.sample import SamplePlan
+from meshkit.ot.stacked import solve_stacked, stackable
 from meshkit.ot.tiles import LOG2_E, MatrixTiles, feature_tiles
 
 __all__ = ["eps_schedule", "sinkhorn", "sinkhorn_from_cost", "sinkhorn_warp"]
@@ -113,6 +114,8 @@ def sinkhorn(
     shape = len(fx), fx.shape[1], fy.shape[1]
     dtype = torch.promote_types(torch.promote_types(fx.dtype, fy.dtype), torch.float32)
     with torch.autocast(fx.device.type, enabled=False):
+        if not check_finite and stackable(fx, fy, cost, options, a, b, mask_x, mask_y):
+            return TransportPlan(solve_stacked(fx.to(dtype), fy.to(dtype), options), shape)
         like = fx.new_empty(0, dtype=dtype)
         keep = options.keep(math.prod(shape) * dtype.itemsize)
         samples = []
