@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -64,10 +66,13 @@ class RiggedModel(nn.Module):
         pose_correctives: ``(9 (J - 1), V, 3)`` linear offsets in the entries of ``R_j - I`` of all joints but the
             root (SMPL's pose blend shapes), or ``None``.
         identities: ``(I, K)`` a table of known identities, for use by index.
-        poses: ``(P, J, 3)`` a table of known poses as rotation vectors, for use by index.
+        poses: ``(P, J, 3)`` a table of known poses as rotation vectors, or ``(P, J, 3, 3)`` as rotation matrices, for
+            use by index.
+        identity_names: what each row of ``identities`` is called; kept as a tuple, empty if nobody said.
+        pose_names: likewise for ``poses``.
 
     Raises:
-        ValueError: shapes disagree, or a parent does not precede its child.
+        ValueError: shapes disagree, a parent does not precede its child, or names do not match their table.
 
     Example:
         >>> from meshkit.data import load_humans
@@ -102,6 +107,8 @@ class RiggedModel(nn.Module):
         pose_correctives: Tensor | None = None,
         identities: Tensor | None = None,
         poses: Tensor | None = None,
+        identity_names: Sequence[str] = (),
+        pose_names: Sequence[str] = (),
     ) -> None:
         super().__init__()
         num_verts, num_joints, num_shapes = len(template), len(joints), len(shape_dirs)
@@ -117,6 +124,8 @@ class RiggedModel(nn.Module):
             "identities": (identities, (0 if identities is None else len(identities), num_shapes)),
             "poses": (poses, (0 if poses is None else len(poses), num_joints, 3)),
         }
+        if poses is not None and poses.dim() == 4:
+            expected["poses"] = (poses, (len(poses), num_joints, 3, 3))
         for name, (value, shape) in expected.items():
             if value is not None and value.shape != shape:
                 raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
@@ -131,6 +140,11 @@ class RiggedModel(nn.Module):
             )
         if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < num_verts:
             raise ValueError(f"faces must index {num_verts} vertices, got {int(faces.min())} to {int(faces.max())}")
+        for table, names in ((identities, identity_names), (poses, pose_names)):
+            if names and (table is None or len(names) != len(table)):
+                rows = "no table" if table is None else f"{len(table)} rows"
+                raise ValueError(f"every row of a table needs one name, got {len(names)} names for {rows}")
+        self.identity_names, self.pose_names = tuple(identity_names), tuple(pose_names)
         self.weights = weights / sums
         self._levels = _levels(ancestry)
 
@@ -193,7 +207,7 @@ class RiggedModel(nn.Module):
 
     def _rotations(self, pose: Tensor) -> Tensor:
         if not pose.is_floating_point():
-            return rotation_matrices(_rows(self.poses, pose, "pose"))
+            pose = _rows(self.poses, pose, "pose")
         if pose.dim() == 3 and pose.shape[1:] == (self.num_joints, 3):
             return rotation_matrices(pose)
         if pose.dim() == 4 and pose.shape[1:] == (self.num_joints, 3, 3):
