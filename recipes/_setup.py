@@ -8,7 +8,7 @@ from typing import Any
 
 from _run import Run, UserError
 
-from meshkit.data import MeshPool, PosePairs, human_split, load_humans
+from meshkit.data import MeshPool, PosePairs, load_shipped
 from meshkit.models import GeneratorConfig
 
 
@@ -16,7 +16,7 @@ def check(cfg: Any) -> None:
     """Refuse values that make no sense before anything is written."""
     counts = ("steps", "batch", "pairs", "points", "pool", "arap_iters", "eval_pairs", "eval_every", "save_every")
     for name in counts:
-        value = getattr(cfg, name)
+        value = getattr(cfg, name, None)
         if value is not None and value < 1:
             raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
     if cfg.steps is None and (cfg.minutes is None or cfg.minutes <= 0):
@@ -25,8 +25,9 @@ def check(cfg: Any) -> None:
         raise UserError(f"--batch {cfg.batch} is more than the --pairs {cfg.pairs} of an epoch")
     if cfg.eval_pairs > 400:
         raise UserError(f"there are 400 test pairs, --eval-pairs asks for {cfg.eval_pairs}")
-    if not 0 <= cfg.decay_from <= 1 or not 0 <= cfg.arap_from <= 1:
-        raise UserError(f"--decay-from and --arap-from are shares, got {cfg.decay_from} and {cfg.arap_from}")
+    for name in ("decay_from", "arap_from"):
+        if not 0 <= getattr(cfg, name, 0.0) <= 1:
+            raise UserError(f"--{name.replace('_', '-')} is a share of the run, got {getattr(cfg, name)}")
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise UserError("this recipe trains in one process: start it with python, not torchrun")
 
@@ -45,7 +46,7 @@ def resumed(cfg: Any, recorded: dict[str, Any]) -> Any:
 
 def data(cfg: Any, run: Run, workers: int) -> tuple[PosePairs, PosePairs]:
     """Training pairs, and test pairs of unseen identities in unseen poses."""
-    body, split = load_humans(cfg.vertices), human_split()
+    body, split = load_shipped(cfg.data, cfg.vertices)
     listed = split.test_pairs[: cfg.eval_pairs]
     pools: dict[str, MeshPool | None] = {"train": None, "test": None}
     if cfg.model.descriptors == "wks":
@@ -58,7 +59,7 @@ def data(cfg: Any, run: Run, workers: int) -> tuple[PosePairs, PosePairs]:
             "test": lambda: MeshPool.of(body, who, how, **shared),
         }
         for side in pools:
-            key = f"{side}, {cfg.vertices} vertices, {cfg.model.num_signatures} signatures, "
+            key = f"{side}, {cfg.data}, {len(body.template)} vertices, {cfg.model.num_signatures} signatures, "
             key += f"pool {cfg.pool}, seed {cfg.seed}" if side == "train" else f"{len(listed)} pairs"
             stored = run.load_tensors(f"pool_{side}.safetensors", key)
             if stored is None:

@@ -112,20 +112,23 @@ PRESETS = {
         descriptors="wks",
     ),
 }
+PRESETS["small"] = replace(PRESETS["tiny"], extractor_widths=(32, 64, 64), k=16)
 _CORENET3D = {
     "paper": GeneratorConfig(extractor="pointwise", extractor_widths=(64, 128, 256)),
     "tiny": replace(PRESETS["tiny"], extractor="pointwise", extractor_widths=(16, 32, 64), extractor_blocks=2),
+    "small": replace(PRESETS["tiny"], extractor="pointwise", extractor_widths=(32, 64, 128)),
 }
-_NPT = {"paper": (64, 128, 1024), "tiny": (32, 64, 253)}
+_NPT = {"paper": (64, 128, 1024), "tiny": (32, 64, 253), "small": (32, 64, 253)}
 
 
 def xdualnet(preset: str = "paper", *, released: bool = False) -> PoseTransferGenerator:
     """X-DualNet's generator.
 
     Args:
-        preset: ``"paper"`` (extractor 32/64/128 over 32 neighbours, blocks 1024/512/256) or ``"tiny"`` (16/32/32 over
-            8 neighbours, blocks 256/128/64 that displace the warped mesh, intrinsic descriptors at the extractor's
-            input and as the blocks' condition), which trains on a laptop's CPU.
+        preset: ``"paper"`` (extractor 32/64/128 over 32 neighbours, blocks 1024/512/256), ``"tiny"`` (16/32/32 over 8
+            neighbours, blocks 256/128/64 that displace the warped mesh, intrinsic descriptors at the extractor's input
+            and as the blocks' condition), which trains on a laptop's CPU, or ``"small"``, that with an extractor
+            32/64/64 over 16 neighbours.
         released: the released code's first convolution, of kernel 3 along the vertex order, and its matching. The
             model is then not permutation-equivariant.
 

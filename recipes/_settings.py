@@ -1,0 +1,95 @@
+"""Settings that all training recipes share, and the command line they are read from. The comments give the paper's."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+
+from meshkit.models import GeneratorConfig
+
+Preset = Literal["tiny", "small", "paper"]
+"""tiny: minutes on a CPU; small: hours on a CPU or minutes on a GPU; paper: the printed sizes and schedule."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run depends on besides its losses. The values are those of the preset; comments give the paper's."""
+
+    preset: Preset = "tiny"
+    """tiny trains on a CPU in minutes, small in hours, or on a GPU in minutes; paper has the printed sizes."""
+    name: str = "run"
+    """Name of the run."""
+    out: Path = Path("runs")
+    """Folder that holds the runs."""
+    resume: bool = False
+    """Go on from the run's last checkpoint, if it has one, with the settings it was begun with: of the other flags only
+    --out, --name, --threads and --accelerator count then."""
+    apply: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="IDENTITY POSE")] = None
+    """Do not train: give the first mesh file the pose of the second, with the weights of run --name."""
+    result: Path = Path("posed.obj")
+    """Where --apply writes the posed mesh."""
+
+    data: str = "humans"
+    """What to train on: humans or animals, which ship with meshkit."""
+    minutes: float | None = 8.0
+    """Training time; turned into a number of steps once, by the measured speed, and recorded. Paper: 24 to 90 hours."""
+    steps: int | None = None
+    """Number of steps, instead of --minutes. Paper: 200 epochs of 1600 (X-DualNet)."""
+    batch: int = 4
+    """Pairs per step. Paper: 4."""
+    pairs: int = 6400
+    """Training pairs per epoch. Paper: 6400 humans, 9000 animals."""
+    resample: bool = True
+    """Draw new pairs each epoch. Paper: one fixed set."""
+    vertices: int | None = None
+    """Vertices per mesh, None for the smallest there are: humans have 1000, 2000, 3445 or 6890, animals 1962. Paper:
+    6890 and 3889."""
+    pool: int = 1200
+    """Training meshes whose signatures are computed beforehand (with --model.descriptors wks)."""
+    workers: int = 0
+    """Processes that draw pairs; the pairs are the same for any number."""
+
+    model: GeneratorConfig = field(default_factory=GeneratorConfig)
+    """Sizes of the generator."""
+
+    lr: float = 1e-3
+    """Learning rate. Paper: 1e-4."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Adam's betas. Released code: 0, 0.9."""
+    adam_eps: float = 1e-8
+    """Adam's eps. Released code: 1e-3."""
+    warmup: int = 50
+    """Steps over which the learning rate rises from zero. Paper: none."""
+    decay_from: float = 0.5
+    """Share of the run after which the learning rate falls linearly to zero. Paper: 0.5 (epoch 100 of 200)."""
+
+    eval_pairs: int = 100
+    """Unseen pairs at the end. Paper: 400."""
+    eval_every: int = 200
+    """Steps between evaluations on 24 unseen pairs, for the curve."""
+    save_every: int = 100
+    """Steps between checkpoints."""
+    seed: int = 0
+    """Of weights, pairs, vertex orders and handles."""
+    threads: int = 0
+    """Threads, 0 for torch's choice. At 1 a run repeats bit for bit."""
+    precision: Literal["auto", "32-true", "bf16-mixed"] = "auto"
+    """auto measures whether bfloat16 is faster here."""
+    accelerator: str = "auto"
+    """Where to train: auto, cpu, cuda, mps."""
+
+
+S = TypeVar("S", bound=Settings)
+
+
+def parse(presets: dict[str, S], description: str | None) -> S:
+    """Read the command line against the chosen preset's values."""
+    words = " ".join(sys.argv[1:]).replace("--preset=", "--preset ").split()
+    chosen = words[words.index("--preset") + 1] if "--preset" in words[:-1] else "tiny"
+    default = presets.get(chosen, presets["tiny"])
+    kind: Any = type(default)
+    return tyro.cli(kind, default=default, description=description)  # type: ignore[no-any-return]

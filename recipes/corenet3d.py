@@ -1,0 +1,105 @@
+"""3D-CoreNet: supervised 3D pose transfer with correspondence learning (Song et al.), the generator of X-DualNet.
+
+    python recipes/corenet3d.py                     # train on the shipped humans, on a laptop's CPU
+    python recipes/corenet3d.py --preset small      # more of everything: hours on a CPU, minutes on a GPU
+    python recipes/corenet3d.py --name corenet3d --apply identity.obj pose.obj --result posed.obj
+
+Like X-DualNet's paper it takes that paper's extractor of three set convolutions; ``--model.extractor pointwise`` is the
+released 3D-CoreNet's. A run writes what a run of ``xdualnet.py`` writes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from _apply import apply
+from _run import guard
+from _settings import Settings, parse
+from _train import train
+from torch import Tensor
+
+from meshkit.data import PairBatch
+from meshkit.losses import edge_ratio_loss, reconstruction_loss
+from meshkit.models.presets import PRESETS as MODELS
+
+
+@dataclass(frozen=True)
+class Config(Settings):
+    """3D-CoreNet's settings."""
+
+    name: str = "corenet3d"
+    """Name of the run."""
+    lambda_rec: float = 1000.0
+    """Weight of the reconstruction. Released code: 1000."""
+    lambda_edge: float = 0.5
+    """Weight of the edge loss (length ratios). Released code: 0.5."""
+
+
+PRESETS = {
+    "tiny": Config(model=MODELS["tiny"], lr=2e-3),
+    "small": Config(
+        preset="small",
+        name="corenet3d-small",
+        model=MODELS["small"],
+        minutes=None,
+        steps=6000,
+        batch=16,
+        pool=8000,
+        lr=2e-3,
+        warmup=200,
+        eval_pairs=400,
+        eval_every=500,
+        save_every=500,
+    ),
+    "paper": Config(
+        preset="paper",
+        name="corenet3d-paper",
+        model=MODELS["paper"],
+        minutes=None,
+        steps=200 * 800,
+        batch=8,
+        resample=False,
+        vertices=6890,
+        lr=1e-4,
+        betas=(0.0, 0.9),
+        adam_eps=1e-3,
+        warmup=0,
+        eval_pairs=400,
+        eval_every=800,
+        save_every=400,
+    ),
+}
+
+
+def build(cfg: Config) -> tuple[torch.nn.Module, torch.nn.Module]:
+    """The generator, which is trained as it is."""
+    generator = cfg.model.build()
+    return generator, generator
+
+
+def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float) -> dict[str, Tensor]:
+    """The weighted losses of one step."""
+    output = system(
+        batch.identity,
+        batch.pose,
+        identity_descriptors=batch.identity_descriptors,
+        pose_descriptors=batch.pose_descriptors,
+    ).vertices
+    return {
+        "rec": cfg.lambda_rec * reconstruction_loss(output, batch.ground_truth),
+        "edge": cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces),
+    }
+
+
+def main() -> None:
+    """Train, or apply what was trained."""
+    cfg = parse(PRESETS, __doc__)
+    if cfg.apply is not None:
+        apply(cfg.out / cfg.name, cfg.apply, cfg.result)
+    else:
+        train(cfg, build, step)
+
+
+if __name__ == "__main__":
+    guard(main)
