@@ -182,28 +182,26 @@ class RiggedModel(nn.Module):
         if self.pose_correctives is not None:
             bend = (rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten(1)
             verts = verts + torch.einsum("bp,pvc->bvc", bend, self.pose_correctives)
-        turns, shifts = self._kinematics(rotations, joints)
         # Columns of the affine maps, so that one matrix product blends those of the whole batch: (4, J, B * 3).
-        columns = torch.cat([turns, shifts[..., None]], -1).permute(3, 1, 0, 2).flatten(2)
+        columns = self._kinematics(rotations, joints)[:, :, :3].permute(3, 1, 0, 2).flatten(2)
         blended = (self.weights @ columns).unflatten(2, (len(verts), 3)).transpose(1, 2)
         x, y, z = verts.split(1, 2)
         return torch.addcmul(torch.addcmul(torch.addcmul(blended[3], blended[0], x), blended[1], y), blended[2], z)
 
-    def _kinematics(self, rotations: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
-        """Affine maps of the joints' rest positions to the posed ones, ``(B, J, 3, 3)`` and ``(B, J, 3)``.
+    def _kinematics(self, rotations: Tensor, joints: Tensor) -> Tensor:
+        """Affine maps ``(B, J, 4, 4)`` that take each joint's surroundings from rest to the pose.
 
-        Each joint starts with its own motion about its rest place; in every round it is followed by what its ancestor
+        Each joint starts with its own turn about its rest place; in every round it is followed by what its ancestor
         has gathered so far, and the ancestor's ancestor takes over. That doubles the length of the chain: a skeleton
         of depth 16 needs four products instead of sixteen. The root's ancestor is an extra joint that never moves.
         """
-        still = torch.eye(3, dtype=rotations.dtype, device=rotations.device)
-        turns = torch.cat([rotations, still.expand(len(rotations), 1, 3, 3)], 1)
-        places = torch.cat([joints, torch.zeros_like(joints[:, :1])], 1)
-        shifts = places - (turns @ places[..., None])[..., 0]
+        maps = torch.eye(4, dtype=rotations.dtype, device=rotations.device)
+        maps = maps.expand(len(rotations), self.num_joints + 1, 4, 4).clone()
+        maps[:, :-1, :3, :3] = rotations
+        maps[:, :-1, :3, 3] = joints - (rotations @ joints[..., None])[..., 0]
         for above in self._ancestors.unbind():
-            shifts = (turns[:, above] @ shifts[..., None])[..., 0] + shifts[:, above]
-            turns = turns[:, above] @ turns
-        return turns[:, :-1], shifts[:, :-1]
+            maps = maps.index_select(1, above) @ maps
+        return maps[:, :-1]
 
     def _betas(self, identity: Tensor) -> Tensor:
         if identity.is_floating_point():
