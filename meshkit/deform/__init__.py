@@ -1,10 +1,12 @@
 """Deformation of meshes: as-rigid-as-possible, with gradients, and deformation transfer."""
 
-from meshkit.deform.arap import PRESETS, ARAPInfo, arap_deform, arap_energy
+from meshkit.deform.arap import PRESETS, arap_deform
 from meshkit.deform.correspondence import key_point_correspondence
 from meshkit.deform.deformer import ARAPDeformer
+from meshkit.deform.energy import arap_energy
 from meshkit.deform.factor import ARAPFactor
 from meshkit.deform.moving_least_squares import rigid_moving_least_squares
+from meshkit.deform.options import ARAPInfo
 from meshkit.deform.rest import ARAPRest
 from meshkit.deform.rotation import closest_rotation
 from meshkit.deform.topology import ARAPTopology
