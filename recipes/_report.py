@@ -43,6 +43,7 @@ def generate(generator: nn.Module, batch: PairBatch) -> Any:
         batch.pose,
         identity_descriptors=batch.identity_descriptors,
         pose_descriptors=batch.pose_descriptors,
+        **({"identity_faces": batch.identity_faces} if getattr(generator, "symmetry", False) else {}),
     )
 
 

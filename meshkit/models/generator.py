@@ -16,6 +16,7 @@ from meshkit.models.ordered import OrderedPoseTransferStack
 from meshkit.models.output import GeneratorOutput
 from meshkit.models.pointwise import PointwiseExtractor
 from meshkit.models.stack import PoseTransferStack
+from meshkit.models.symmetry import mirror_labels
 from meshkit.nn import SetConvExtractor
 from meshkit.ot import TransportPlan, sinkhorn
 
@@ -58,6 +59,10 @@ class PoseTransferGenerator(nn.Module):
             of the pose mesh's body.
         normalize_plan: warp with the row-normalised plan (released code). ``False`` warps with the raw plan as the
             paper prints it, whose rows sum to 1/N, so that the warped mesh is N times too small.
+        symmetry: in evaluation, given ``identity_faces``, look at the identity mesh's mirror image too, and let
+            :func:`~meshkit.models.symmetry.mirror_labels` choose for each vertex which of the two it is matched as.
+            Limbs that are exchanged by a mistaken matching are put right where they would be torn. Takes bodies
+            whose left and right lie along x.
         released: the released code to the letter: its first convolution
             (:class:`~meshkit.models.OrderedPoseTransferStack`), and the 1e-8 that it adds to the denominators of the
             matching. For checkpoints of that code; see :func:`~meshkit.models.load_released_checkpoint`.
@@ -94,6 +99,7 @@ class PoseTransferGenerator(nn.Module):
         condition: str = "features",
         rigid_radius: float | None = None,
         match_size: bool = False,
+        symmetry: bool = False,
         normalize_plan: bool = True,
         released: bool = False,
     ) -> None:
@@ -110,6 +116,7 @@ class PoseTransferGenerator(nn.Module):
             raise ValueError('condition="descriptors" and match_size need descriptors: give their number of channels')
         self.eps, self.n_iters, self.normalize_plan = eps, n_iters, normalize_plan
         self.condition, self.rigid_radius, self.match_size = condition, rigid_radius, match_size
+        self.symmetry = symmetry
         features = extractor_widths[-1]
         self.extractor: SetConvExtractor | PointwiseExtractor
         if extractor == "setconv":
@@ -176,6 +183,40 @@ class PoseTransferGenerator(nn.Module):
         floor = STABILIZER if isinstance(self.extractor, SetConvExtractor) else 0.0
         return stabilized_matching(*pair, **options, floor=floor)
 
+    def _warp(
+        self, identity: Tensor, pose: Tensor, positions: Tensor, identity_mask: Tensor | None, pose_mask: Tensor | None
+    ) -> tuple[TransportPlan | DensePlan, Tensor]:
+        """The plan between two meshes' features, and the pose mesh's positions carried by it."""
+        plan = self._match(identity, pose, identity_mask, pose_mask)
+        values = positions.to(plan.dtype)
+        return plan, plan.barycentric(values) if self.normalize_plan else plan @ values
+
+    @torch.no_grad()
+    def _handed(
+        self,
+        verts: Tensor,
+        faces: Tensor,
+        descriptors: Tensor | None,
+        features: Tensor,
+        *pair: Any,
+    ) -> Tensor:
+        """Features of the identity mesh, of its mirror image where that is what a vertex is better matched as."""
+        mask = pair[2]
+        mirrored = self.encode(verts * verts.new_tensor([-1.0, 1.0, 1.0]), mask=mask, descriptors=descriptors)
+        targets, others = (self._warp(f, *pair)[1] for f in (features, mirrored))
+        partners = self._match(mirrored, features, mask, mask).argmax()
+        labels = []
+        for b in range(len(verts)):
+            real = slice(None) if mask is None else mask[b].nonzero()[:, 0]
+            own = faces if faces.dim() == 2 else faces[b]
+            mesh = [verts[b, real], own[(own >= 0).all(1)], targets[b, real], others[b, real], partners[b, real]]
+            if mask is not None:
+                place = mask[b].cumsum(0) - 1
+                mesh[1], mesh[4] = place[mesh[1]], place[mesh[4]]
+            labels.append(torch.zeros(verts.shape[1], dtype=torch.bool, device=verts.device))
+            labels[-1][real] = mirror_labels(*mesh)
+        return torch.where(torch.stack(labels)[..., None], mirrored, features)
+
     def forward(
         self,
         identity: Tensor,
@@ -187,8 +228,12 @@ class PoseTransferGenerator(nn.Module):
         pose_descriptors: Tensor | None = None,
         identity_features: Tensor | None = None,
         pose_features: Tensor | None = None,
+        identity_faces: Tensor | None = None,
     ) -> GeneratorOutput:
         """Give the identity mesh the pose of the pose mesh; features are computed unless given.
+
+        ``identity_faces``, ``(F, 3)`` or ``(B, F, 3)`` padded with -1, are looked at if the model has ``symmetry``, in
+        evaluation.
 
         With ``condition="descriptors"``, ``identity_descriptors`` are needed even beside given features.
         """
@@ -198,18 +243,19 @@ class PoseTransferGenerator(nn.Module):
             identity_features = self.encode(identity, mask=identity_mask, descriptors=identity_descriptors)
         if pose_features is None:
             pose_features = self.encode(pose, mask=pose_mask, descriptors=pose_descriptors)
-        plan = self._match(identity_features, pose_features, identity_mask, pose_mask)
         if pose_mask is not None:
             pose = pose.masked_fill(~pose_mask[..., None], 0.0)
-        values = pose.to(plan.dtype)
         if self.match_size:
             if identity_descriptors is None or pose_descriptors is None:
                 raise ValueError("match_size needs identity_descriptors and pose_descriptors, also beside features")
             growth = masked_mean(identity_descriptors[..., -1:], identity_mask) - masked_mean(
                 pose_descriptors[..., -1:], pose_mask
             )
-            values = values * growth.exp()[:, None]
-        warped = plan.barycentric(values) if self.normalize_plan else plan @ values
+            pose = pose * growth.exp()[:, None]
+        pair = (identity_features, pose_features, pose, identity_mask, pose_mask)
+        if self.symmetry and not self.training and identity_faces is not None:
+            pair = (self._handed(identity, identity_faces, identity_descriptors, *pair), *pair[1:])
+        plan, warped = self._warp(*pair)
         standard = None if identity_descriptors is None else self._standardise(identity_descriptors)
         if self.condition == "descriptors" and standard is None:
             raise ValueError('condition="descriptors" needs identity_descriptors, also beside identity_features')

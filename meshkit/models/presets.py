@@ -51,6 +51,8 @@ class GeneratorConfig:
     """Radius of the rigid moving least squares that the warped mesh passes through, in metres. Paper: none."""
     match_size: bool = False
     """Scale the pose mesh to the identity's size before warping it, where there are descriptors. Paper: no."""
+    symmetry: bool = False
+    """In evaluation, resolve exchanged limbs with the identity's mirror image (needs faces). Paper: no."""
     descriptors: str = "none"
     """none: coordinates alone, the paper; wks: wave-kernel signatures and the size of the mesh besides."""
     num_signatures: int = 16
@@ -109,6 +111,7 @@ PRESETS = {
         residual=True,
         rigid_radius=0.25,
         match_size=True,
+        symmetry=True,
         descriptors="wks",
     ),
 }
