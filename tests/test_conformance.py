@@ -70,7 +70,6 @@ class Entry:
     inert: Sequence[str] = ()  # parameters without effect in this configuration
     # "fullgraph", "forward" (fullgraph, without gradient), "breaks" (with graph breaks) or None (not here)
     compile: str | None = "fullgraph"
-    default_device: bool = True  # False: sets up on the CPU whatever the inputs, through the default device
     bf16: float = 0.05  # relative deviation allowed under autocast
 
 
@@ -185,8 +184,6 @@ ENTRIES = {
         {"rest": ("a", 3), "target": ("a", 3)},
         {"a": ["mask"]},
         {"faces": ("a", strip), "handles": ("a", lambda n: torch.arange(0, n, 2))},
-        constants=["rest"],
-        default_device=False,
         compile=None,  # equal, but its loops are unrolled, which takes minutes
     ),
     "RiggedModel": Entry(
@@ -252,7 +249,6 @@ ENTRIES |= {
         {"verts": ("a", 3), "reference": ("a", 3)},
         **SURFACE | {"compile": None},  # as ARAPDeformer
         constants=["reference"],
-        default_device=False,
     ),
     "CycleReconstruction": Entry(
         lambda: CycleReconstruction(PoseTransferGenerator(**SMALL, residual=True)),
@@ -515,8 +511,6 @@ def test_gradient_reaches_every_parameter(name):
 def test_no_tensor_is_made_on_the_default_device(name):
     """With another default device, everything still happens where the inputs are."""
     entry = ENTRIES[name]
-    if not entry.default_device:
-        pytest.skip("sets up on the CPU, through the default device")
     module, inputs = make(entry), entry.prepare(pair(entry))
     expected = entry.result(module(**inputs))
     with torch.device("meta"):
