@@ -180,11 +180,18 @@ ENTRIES = {
         bf16=0.2,  # two generators, one after the other
     ),
     "ARAPDeformer": Entry(
-        lambda: ARAPDeformer(0.5, max_iter=3),
+        lambda: ARAPDeformer(0.5, max_iter=3, method="local_global"),
         {"rest": ("a", 3), "target": ("a", 3)},
         {"a": ["mask"]},
         {"faces": ("a", strip), "handles": ("a", lambda n: torch.arange(0, n, 2))},
         compile=None,  # equal, but its loops are unrolled, which takes minutes
+    ),
+    "ARAPDeformer-batched": Entry(
+        lambda: ARAPDeformer(0.5, max_iter=3, solver="dense"),
+        {"rest": ("a", 3), "target": ("a", 3)},
+        {"a": ["mask"]},
+        {"faces": ("a", strip), "handles": ("a", lambda n: torch.arange(0, n, 2))},
+        compile=None,  # as above
     ),
     "RiggedModel": Entry(
         rigged,

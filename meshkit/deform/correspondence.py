@@ -102,7 +102,7 @@ def key_point_correspondence(
     rows = torch.arange(len(target), device="cpu")[:, None].expand_as(near)
     index = torch.stack([rows.flatten(), near.flatten()])
     size = (len(target), len(source))
-    return torch.sparse_coo_tensor(index, weights.flatten(), size, check_invariants=False).coalesce()
+    return torch.sparse_coo_tensor(index, weights.flatten(), size, device="cpu", check_invariants=False).coalesce()
 
 
 def check_points(points: Tensor, name: str, *, batched: bool = False) -> None:
