@@ -7,11 +7,12 @@ import torch
 from conftest import rand
 
 from meshkit.data import load_humans
-from meshkit.deform import ARAPDeformer, ARAPInfo, arap_deform, closest_rotation
+from meshkit.deform import ARAPDeformer, ARAPInfo, arap_deform, arap_energy, closest_rotation
 from meshkit.deform.batched import BatchedEnergy
 from meshkit.deform.batched_factor import BatchedFactor
 from meshkit.deform.batched_objective import BatchedObjective, alternate_batch
 from meshkit.deform.batched_rotation import BatchedRotation
+from meshkit.deform.energy import energy_of_batch
 from meshkit.topology import connected_components, cotangent_laplacian
 
 ENERGIES = ["spokes_and_rims", "spokes", "spokes_unclamped", "elements"]
@@ -126,6 +127,24 @@ def test_factor_solves(device: str, solver: str) -> None:
         expected = torch.linalg.solve(matrix[own][:, own], right[b].cpu()[own])
         torch.testing.assert_close(got[b][own], expected, rtol=1e-8, atol=1e-8)
         assert not got[b][~own].any()
+
+
+@ON_DEVICES
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_energy_and_its_gradients(device: str, energy: str) -> None:
+    verts, faces, _, _, mask = ragged()
+    deformed = verts + 0.2 * rand(*verts.shape, seed=8)
+    results = []
+    for place, function in (("cpu", arap_energy), (device, energy_of_batch)):
+        leaves = [value.clone().to(place).requires_grad_() for value in (verts, deformed)]
+        options: dict[str, Any] = {"energy": energy, "mask": mask.to(place), "degenerate": "raise"}
+        values = function(leaves[0], faces.to(place), leaves[1], **options)
+        (values * rand(3, seed=1).to(place)).sum().backward()
+        results.append([value.cpu() for value in (values, *(leaf.grad for leaf in leaves))])
+    for got, expected in zip(results[1], results[0], strict=True):
+        torch.testing.assert_close(got, expected, rtol=1e-8, atol=1e-9)
+    assert energy_of_batch(verts, faces, deformed[:, 1:], **options) is None
+    assert energy_of_batch(verts, faces, deformed, **options | {"mask": None}) is None  # NaN in the padding
 
 
 # ---------------------------------------------------------------- deformation
