@@ -136,7 +136,9 @@ class _Smoother:
         mass = mass_matrix(verts, faces, kind="barycentric").numpy()
         # A vertex without area stays where its face carries it.
         self._pull = np.maximum(mass, 1e-9 * mass.max() + 1e-300) / (_SMOOTHING * mean_edge) ** 2
-        self._solve = splu((stiffness + diags(self._pull)).tocsc(), permc_spec="MMD_AT_PLUS_A").solve
+        # Positive definite: no pivoting, which keeps the factor as sparse as the ordering made it.
+        matrix, symmetric = (stiffness + diags(self._pull)).tocsc(), {"SymmetricMode": True}
+        self._solve = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric).solve
 
     def smooth(self, target: Points, maps: Points) -> Points:
         bent = np.einsum("eij,ej->ei", (maps[self._i] + maps[self._j]) / 2, self._edges) * self._weight[:, None]
