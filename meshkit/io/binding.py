@@ -1,5 +1,7 @@
 """Carry a deformation from a coarse surface to a fine one that lies close to it."""
 
+from functools import partial
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -116,11 +118,10 @@ class SurfaceBinding:
 
 
 class _Smoother:
-    """The least-squares problem of the docstring above, factored once."""
+    """The least-squares problem of the docstring above."""
 
     def __init__(self, points: Points, triangles: Indices, coarse: Points, coarse_triangles: Indices) -> None:
         from scipy.sparse import coo_matrix, diags
-        from scipy.sparse.linalg import splu
 
         verts, faces = torch.from_numpy(points), torch.from_numpy(triangles)
         half_cotangents = cotangent_weights(verts, faces).numpy()
@@ -135,15 +136,19 @@ class _Smoother:
         mean_edge = np.linalg.norm(coarse[ends[:, 0]] - coarse[ends[:, 1]], axis=1).mean()
         mass = mass_matrix(verts, faces, kind="barycentric").numpy()
         # A vertex without area stays where its face carries it.
-        self._pull = np.maximum(mass, 1e-9 * mass.max() + 1e-300) / (_SMOOTHING * mean_edge) ** 2
-        # Positive definite: no pivoting, which keeps the factor as sparse as the ordering made it.
-        matrix, symmetric = (stiffness + diags(self._pull)).tocsc(), {"SymmetricMode": True}
-        self._solve = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric).solve
+        self._pull = np.maximum(mass, 1e-9 * (mass.max() or 1.0)) / (_SMOOTHING * mean_edge) ** 2
+        self._matrix = (stiffness + diags(self._pull)).tocsr()
+        self._preconditioner = diags(1 / self._matrix.diagonal())
 
     def smooth(self, target: Points, maps: Points) -> Points:
+        from scipy.sparse.linalg import cg
+
         bent = np.einsum("eij,ej->ei", (maps[self._i] + maps[self._j]) / 2, self._edges) * self._weight[:, None]
         pulls = np.stack([np.bincount(self._i, column, len(target)) for column in bent.T], axis=1)
-        return np.asarray(self._solve(pulls + self._pull[:, None] * target))
+        right = pulls + self._pull[:, None] * target
+        # The pull is strong, so that some ten steps from the target are enough, on meshes of any size.
+        solve = partial(cg, self._matrix, M=self._preconditioner, rtol=1e-8, maxiter=500)
+        return np.stack([solve(right[:, k], x0=target[:, k])[0] for k in range(3)], axis=1)
 
 
 def _frames(points: Points, triangles: Indices) -> tuple[Points, Points]:
