@@ -17,7 +17,10 @@ from meshkit.models import GeneratorConfig, load_generator
 pytest.importorskip("tyro")
 pytest.importorskip("lightning_fabric")
 
-TINY = "--threads 1 --accelerator cpu --precision 32-true --pairs 12 --pool 3 --eval-pairs 2 --batch 2".split()
+TINY = (
+    *("--threads", 1, "--accelerator", "cpu", "--precision", "32-true"),
+    *("--pairs", 12, "--pool", 3, "--eval-pairs", 2, "--batch", 2),
+)
 SMALL_EXTRACTOR = ("--model.k", 4, "--model.extractor-widths", 8, 8)
 WITHOUT_DESCRIPTORS = ("--model.descriptors", "none", "--model.condition", "features")
 
