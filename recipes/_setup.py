@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
+from dataclasses import replace
 from typing import Any
 
+from _machine import world_size
 from _run import Run, UserError
 
 from meshkit.data import MeshPool, PosePairs, load_shipped
@@ -14,34 +15,59 @@ from meshkit.models import GeneratorConfig
 
 def check(cfg: Any) -> None:
     """Refuse values that make no sense before anything is written."""
-    counts = ("steps", "batch", "pairs", "points", "pool", "arap_iters", "eval_pairs", "eval_every", "save_every")
+    counts = (
+        "steps",
+        "batch",
+        "accumulate",
+        "devices",
+        "pairs",
+        "points",
+        "pool",
+        "arap_iters",
+        "eval_pairs",
+        "eval_every",
+        "save_every",
+    )
     for name in counts:
         value = getattr(cfg, name, None)
         if value is not None and value < 1:
             raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
     if cfg.steps is None and (cfg.minutes is None or cfg.minutes <= 0):
         raise UserError(f"give --steps, or positive --minutes, got {cfg.minutes}")
-    if cfg.batch > cfg.pairs:
-        raise UserError(f"--batch {cfg.batch} is more than the --pairs {cfg.pairs} of an epoch")
+    together, processes = cfg.batch * cfg.accumulate * world_size(cfg.devices), world_size(cfg.devices)
+    if together > cfg.pairs:
+        times = f" x --accumulate {cfg.accumulate} x {processes} processes" if together > cfg.batch else ""
+        raise UserError(f"--batch {cfg.batch}{times} is more than the --pairs {cfg.pairs} of an epoch")
     if cfg.eval_pairs > 400:
         raise UserError(f"there are 400 test pairs, --eval-pairs asks for {cfg.eval_pairs}")
     for name in ("decay_from", "arap_from"):
         if not 0 <= getattr(cfg, name, 0.0) <= 1:
             raise UserError(f"--{name.replace('_', '-')} is a share of the run, got {getattr(cfg, name)}")
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise UserError("this recipe trains in one process: start it with python, not torchrun")
 
 
-def resumed(cfg: Any, recorded: dict[str, Any]) -> Any:
-    """The recorded configuration: a run that goes on must be the run that was begun."""
+def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = None) -> Any:
+    """The recorded configuration: a run that goes on must be the run that was begun.
+
+    With another number of processes than before, gradients are accumulated over more or fewer batches, so that an
+    update still sees ``pairs_per_step``, and the same ones.
+    """
     try:
         model = GeneratorConfig.from_json(json.dumps(recorded.pop("model")))
         values = {key: value for key, value in recorded.items() if key in type(cfg).__dataclass_fields__}
         values |= {"betas": tuple(values["betas"]), "out": cfg.out, "name": cfg.name, "resume": True, "apply": None}
-        values |= {"result": cfg.result, "threads": cfg.threads, "accelerator": cfg.accelerator}
-        return type(cfg)(**values, model=model)
+        values |= {"result": cfg.result, "threads": cfg.threads, "accelerator": cfg.accelerator, "devices": cfg.devices}
+        begun = type(cfg)(**values, model=model)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"config.json of {cfg.out / cfg.name} is no run's ({error}): choose another --name") from None
+    processes = world_size(cfg.devices)
+    if pairs_per_step is None or pairs_per_step == begun.batch * begun.accumulate * processes:
+        return begun
+    batch = min(begun.batch, max(1, pairs_per_step // processes))
+    if pairs_per_step % (batch * processes):
+        raise UserError(
+            f"the run was begun with {pairs_per_step} pairs per step, which {processes} processes cannot share evenly"
+        )
+    return replace(begun, batch=batch, accumulate=pairs_per_step // (batch * processes))
 
 
 def data(cfg: Any, run: Run, workers: int) -> tuple[PosePairs, PosePairs]:

@@ -20,12 +20,12 @@ from recipe_runs import ROOT, command, environment, launch, read_json, read_log,
 from safetensors.torch import load_file
 from scipy.spatial import cKDTree
 
-from meshkit.data import MeshPool, PosePairs, human_split, load_humans
+from meshkit.data import MeshPool, PairSampler, PosePairs, human_split, load_humans, pair_loader
 from meshkit.io import load_mesh, save_mesh
 from meshkit.models import GeneratorConfig, load_generator
 
 pytest.importorskip("tyro")
-pytest.importorskip("lightning_fabric")
+Fabric = pytest.importorskip("lightning_fabric").Fabric
 
 STEPS, BATCH, EVAL_PAIRS = 8, 2, 4
 # The processor and full precision, so that runs repeat bit for bit wherever the tests run.
@@ -47,7 +47,7 @@ def setup() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def loop() -> ModuleType:
-    return recipe_module("_train")
+    return recipe_module("_step")
 
 
 @pytest.fixture(scope="module")
@@ -320,11 +320,11 @@ def test_measuring_the_speed_leaves_no_trace(recipe: ModuleType, loop: ModuleTyp
     cfg = replace(cfg, minutes=2.0, warmup=0)
     split = human_split()
     pairs = PosePairs(load_humans(), split.train_identities, split.train_poses, length=20)
-    fabric = loop.Fabric(accelerator="cpu", devices=1)
+    fabric = Fabric(accelerator="cpu", devices=1)
     generator, system = recipe.build(cfg)
     system, optimizer = fabric.setup(system, torch.optim.Adam(generator.parameters()))
     weights = {name: value.clone() for name, value in generator.state_dict().items()}
-    loader = loop.pair_loader(pairs, loop.PairSampler(20, 2, stop=5))
+    loader = pair_loader(pairs, PairSampler(20, 2, stop=5))
     steps = loop.count_steps(cfg, fabric, system, optimizer, recipe.step, loader)
     assert 10 < steps < 1_000_000
     assert all(torch.equal(value, weights[name]) for name, value in generator.state_dict().items())
