@@ -27,6 +27,10 @@ def connect(cfg: S) -> tuple[Fabric, S]:
         share = fabric.all_reduce(torch.tensor(float(cfg.precision == "bf16-mixed"), device=fabric.device))
         if cast(torch.Tensor, share) not in (0, 1):
             raise UserError("the processes do not agree on whether bfloat16 is faster: choose with --precision")
+    if cfg.graph and fabric.device.type != "cuda":
+        raise UserError(f"--graph records CUDA kernels, but this run is on {fabric.device}: leave it out")
+    if cfg.graph and (cfg.compile or fabric.world_size > 1):
+        raise UserError("--graph is for one process and without --compile: leave one of them out")
     return fabric, cfg
 
 

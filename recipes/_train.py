@@ -21,7 +21,7 @@ from _report import evaluate, report
 from _run import Interruption, Run, UserError
 from _settings import Settings
 from _setup import check, data, resumed
-from _step import Diverged, Step, count_steps, train_step
+from _step import Diverged, Step, Trainer, count_steps
 from torch import nn
 from tqdm import tqdm
 
@@ -56,7 +56,7 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         torch.manual_seed(cfg.seed)
         generator, system = build(cfg)
         with fabric.rank_zero_first():
-            train_pairs, test_pairs = data(cfg, run, workers=torch.get_num_threads())
+            train_pairs, test_pairs = (side.to(fabric.device) for side in data(cfg, run, torch.get_num_threads()))
     except (ValueError, RuntimeError) as error:
         raise UserError(str(error)) from None
     if train_pairs.pool is not None:
@@ -73,7 +73,8 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         sampler = PairSampler(cfg.pairs, cfg.batch * cfg.accumulate, start=start, stop=stop, **order)
         return pair_loader(train_pairs, sampler, workers=cfg.workers)
 
-    steps = count_steps(cfg, fabric, system, optimizer, step, loader(0, 5))
+    trainer = Trainer(fabric, system, optimizer, cfg, step, 0)
+    trainer.steps = steps = count_steps(trainer, loader(0, 5))
     cfg = replace(cfg, steps=steps)
     run.save_json("config.json", json.loads(json.dumps(asdict(cfg), default=str)))
     run.save_json("model.json", asdict(cfg.model))
@@ -101,7 +102,7 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         batch = next(batches).to(fabric.device)
         waiting += time.perf_counter() - asked
         try:
-            losses = train_step(fabric, system, optimizer, batch, cfg, step, s, steps)
+            losses = trainer.update(batch, s)
         except Diverged as error:
             advice = "Training has diverged: begin again under another --name with a smaller --lr"
             raise UserError(f"{error}; {run.last_checkpoint()}. {advice}") from None

@@ -62,23 +62,32 @@ def test_two_processes_equal_one_although_one_of_them_is_killed(single: Path, tm
     with subprocess.Popen(
         [*torchrun, "--max-restarts", "1", "--monitor-interval", "0.2", *script, *SMALL.split()],
         cwd=ROOT,
-        env=environment(),
+        # Without the variable, processes that start again may read each other's old addresses.
+        env=environment() | {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
     ) as agent:
-        deadline = time.monotonic() + 120
-        while not (folder / "state.pt").exists():
-            assert agent.poll() is None and time.monotonic() < deadline
-            time.sleep(0.005)
-        os.kill(workers(agent.pid)[1], signal.SIGKILL)
-        errors = agent.communicate(timeout=240)[1]
-        assert agent.returncode == 0, errors
+        try:
+            deadline = time.monotonic() + 90
+            while not (folder / "state.pt").exists():
+                assert agent.poll() is None and time.monotonic() < deadline
+                time.sleep(0.005)
+            os.kill(workers(agent.pid)[1], signal.SIGKILL)
+            errors = agent.communicate(timeout=120)[1]
+        finally:
+            for pid in workers(agent.pid) if agent.poll() is None else []:
+                os.kill(pid, signal.SIGKILL)
+            agent.kill()
+    assert agent.returncode == 0, errors
     assert errors.count("All distributed processes registered. Starting with 2 processes") == 2
     assert_same_run(folder, single)
 
 
 def test_accumulated_batches_equal_one_large_batch(single: Path, tmp_path: Path) -> None:
+    """For the first updates: with more passes per update the spectral norms' power iterations are ahead later on."""
     run = launch("xdualnet", "--out", tmp_path, "--name", "a", "--batch", 2, "--accumulate", 2, *SMALL.split())
     assert run.returncode == 0, run.stderr
-    assert_same_run(tmp_path / "a", single)
+    torch.testing.assert_close(losses(tmp_path / "a")[:3], losses(single)[:3], rtol=1e-4, atol=0)
+    summaries = [read_json(folder / "summary.json") for folder in (tmp_path / "a", single)]
+    assert summaries[0]["pairs_seen"] == summaries[1]["pairs_seen"] == 4 * STEPS

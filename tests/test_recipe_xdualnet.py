@@ -325,11 +325,13 @@ def test_measuring_the_speed_leaves_no_trace(recipe: ModuleType, loop: ModuleTyp
     system, optimizer = fabric.setup(system, torch.optim.Adam(generator.parameters()))
     weights = {name: value.clone() for name, value in generator.state_dict().items()}
     loader = pair_loader(pairs, PairSampler(20, 2, stop=5))
-    steps = loop.count_steps(cfg, fabric, system, optimizer, recipe.step, loader)
+    trainer = loop.Trainer(fabric, system, optimizer, cfg, recipe.step, 0)
+    steps = loop.count_steps(trainer, loader)
     assert 10 < steps < 1_000_000
     assert all(torch.equal(value, weights[name]) for name, value in generator.state_dict().items())
     assert optimizer.state_dict()["state"] == {}
-    assert loop.count_steps(replace(cfg, steps=7), fabric, system, optimizer, recipe.step, loader) == 7
+    trainer.cfg = replace(cfg, steps=7)
+    assert loop.count_steps(trainer, loader) == 7
 
 
 # Other ways to run
