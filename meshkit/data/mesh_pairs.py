@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from meshkit.batching import pad, pad_faces
+from meshkit.batching import center
 from meshkit.data.batch import PairBatch
 from meshkit.data.sampler import seeded
 from meshkit.data.store import MeshStore
@@ -104,45 +105,52 @@ class MeshPairs(Dataset[PairBatch]):
     def __getitem__(self, address: tuple[int, int] | Sequence[tuple[int, int]]) -> PairBatch:
         """The pairs at one or several ``(epoch, i)``, as a batch."""
         addresses = [address] if isinstance(address, tuple) else address
-        dice = torch.Generator()
-        columns = list(zip(*(self._item(dice, epoch, i) for epoch, i in addresses), strict=True))
-        verts_a, faces_a, verts_b, faces_b, truths, matches, places = columns
-        identity, mask_a = pad(verts_a)
-        pose, mask_b = pad(verts_b)
-        index = torch.tensor(places)
+        store, dice = self.store, torch.Generator()
+        draws = torch.tensor([self._draw(dice, epoch if self.resample else 0, i) for epoch, i in addresses])
+        a, b, c = draws.unbind(1)
+        identity, identity_faces, mask_a = self._allocate(a)
+        pose, pose_faces, mask_b = self._allocate(b)
+        truth = torch.zeros_like(identity) if self.ground_truth else identity[:, :0]
+        match = torch.full(identity.shape[:2], -1)
+        registered = (store.topology[a] == store.topology[b]).tolist()
+        for row, (epoch, i) in enumerate(addresses):
+            k, m, t = draws[row].tolist()
+            orders = self._orders(dice, epoch, i, k, m)
+            rank_b = _take(store, m, orders[1], pose[row], pose_faces[row])
+            _take(store, k, orders[0], identity[row], identity_faces[row])
+            if registered[row]:
+                torch.index_select(rank_b, 0, orders[0], out=match[row, : len(orders[0])])
+            if self.ground_truth:
+                torch.index_select(store.view("verts", t), 0, orders[0], out=truth[row, : len(orders[0])])
+            if self.pose_noise > 0:
+                real = pose[row, : len(orders[1])]
+                real += self.pose_noise * torch.randn(real.shape, generator=seeded(dice, self.seed + 3, epoch, i))
         return PairBatch(
-            identity=identity,
-            identity_faces=pad_faces(faces_a),
-            pose=pose,
-            pose_faces=pad_faces(faces_b),
-            ground_truth=pad(truths)[0] if self.ground_truth else identity[:, :0],
-            correspondence=torch.nn.utils.rnn.pad_sequence(list(matches), batch_first=True, padding_value=-1),
-            identity_index=self.store.identity[index[:, 0]],
-            pose_index=self.store.pose[index[:, 1]],
-            identity_mask=None if bool(mask_a.all()) else mask_a,
-            pose_mask=None if bool(mask_b.all()) else mask_b,
+            identity=_shift(identity, store.center[a], mask_a),
+            identity_faces=identity_faces,
+            pose=center(pose, mask_b) if self.pose_noise > 0 else _shift(pose, store.center[b], mask_b),
+            pose_faces=pose_faces,
+            ground_truth=_shift(truth, store.center[c], mask_a) if self.ground_truth else truth,
+            correspondence=match,
+            identity_index=store.identity[a],
+            pose_index=store.pose[b],
+            identity_mask=mask_a,
+            pose_mask=mask_b,
         )
 
-    def _item(
-        self, dice: torch.Generator, epoch: int, i: int
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor, tuple[int, int]]:
-        a, b, c = self._draw(dice, epoch if self.resample else 0, i)
-        store = self.store
-        verts_a, verts_b = store.verts(a), store.verts(b)
-        order_a, order_b = torch.arange(len(verts_a)), torch.arange(len(verts_b))
-        if self.shuffle:
-            seeded(dice, self.seed + 1, epoch, i)
-            order_a = torch.randperm(len(verts_a), generator=dice)
-            order_b = torch.randperm(len(verts_b), generator=dice)
-        if self.pose_noise > 0:
-            noise = torch.randn(verts_b.shape, generator=seeded(dice, self.seed + 3, epoch, i))
-            verts_b = verts_b + self.pose_noise * noise
-        rank_a, rank_b = _inverse(order_a), _inverse(order_b)
-        registered = bool(store.topology[a] == store.topology[b])
-        match = rank_b[order_a] if registered else torch.full_like(order_a, -1)
-        truth = _centred(store.verts(c))[order_a] if self.ground_truth else None
-        faces_a, faces_b = rank_a[store.faces(a)], rank_b[store.faces(b)]
-        return _centred(verts_a)[order_a], faces_a, _centred(verts_b)[order_b], faces_b, truth, match, (a, b)
+    def _allocate(self, meshes: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Room for vertices and faces of a batch, and the mask if they differ in number."""
+        verts, faces = self.store.num_verts[meshes], self.store.num_faces[meshes]
+        most = int(verts.max())
+        mask = None if bool((verts == most).all()) else torch.arange(most) < verts[:, None]
+        return torch.zeros(len(meshes), most, 3), torch.full((len(meshes), int(faces.max()), 3), -1), mask
+
+    def _orders(self, dice: torch.Generator, epoch: int, i: int, a: int, b: int) -> tuple[Tensor, Tensor]:
+        num_a, num_b = int(self.store.num_verts[a]), int(self.store.num_verts[b])
+        if not self.shuffle:
+            return torch.arange(num_a), torch.arange(num_b)
+        seeded(dice, self.seed + 1, epoch, i)
+        return torch.randperm(num_a, generator=dice), torch.randperm(num_b, generator=dice)
 
     def _draw(self, dice: torch.Generator, epoch: int, i: int) -> tuple[int, int, int]:
         """Places of identity mesh, pose mesh and ground truth; the last is -1 without."""
@@ -174,34 +182,37 @@ class _Choice:
     """Draws from some meshes of a store, in time that does not grow with their number."""
 
     def __init__(self, store: MeshStore, members: Tensor) -> None:
-        self.members = members
         who, how = store.identity[members], store.pose[members]
         by_identity, by_pose = torch.argsort(who, stable=True), torch.argsort(how, stable=True)
-        self.identity_row, self.identity_start = _groups(who)
-        self.pose_row, self.pose_start = _groups(how)
-        self.of_identity, self.of_pose = members[by_identity], members[by_pose]
-        # Where the pose of each entry of of_identity is found in of_pose.
-        self.pose_of = self.pose_row[by_identity]
+        (identity_row, identity_start), (pose_row, pose_start) = _groups(who), _groups(how)
+        # Lists, because single entries of tensors are slow to read.
+        self.members: list[int] = members.tolist()
+        self.identity_row: list[int] = identity_row.tolist()
+        self.identity_start: list[int] = identity_start.tolist()
+        self.pose_start: list[int] = pose_start.tolist()
+        self.of_identity: list[int] = members[by_identity].tolist()
+        self.of_pose: list[int] = members[by_pose].tolist()
+        self.pose_of: list[int] = pose_row[by_identity].tolist()  # the group of the pose of each entry of of_identity
 
     def has_pairs(self) -> bool:
         """Whether some pose is shared by two meshes."""
-        return int(self.pose_start.diff().max()) > 1
+        return max(b - a for a, b in pairwise(self.pose_start)) > 1
 
     def any_two(self, dice: torch.Generator) -> tuple[int, int]:
         """Two meshes, different if there are two."""
-        a = _below(len(self.members), dice)
-        b = _below(max(1, len(self.members) - 1), dice)
-        return int(self.members[a]), int(self.members[min(b + (b >= a), len(self.members) - 1)])
+        u, v, _ = torch.rand(3, generator=dice, dtype=torch.float64).tolist()
+        count = len(self.members)
+        a, b = int(u * count), int(v * max(1, count - 1))
+        return self.members[a], self.members[min(b + (b >= a), count - 1)]
 
     def with_truth(self, dice: torch.Generator) -> tuple[int, int, int]:
         """A mesh; a mesh in some pose that the first one's identity takes too; and that identity in that pose."""
-        a = _below(len(self.members), dice)
-        start, stop = self.identity_start[self.identity_row[a] : self.identity_row[a] + 2].tolist()
-        place = start + _below(stop - start, dice)
-        row = int(self.pose_of[place])
-        first, last = self.pose_start[row : row + 2].tolist()
-        b = first + _below(last - first, dice)
-        return int(self.members[a]), int(self.of_pose[b]), int(self.of_identity[place])
+        u, v, w = torch.rand(3, generator=dice, dtype=torch.float64).tolist()
+        a = int(u * len(self.members))
+        start, stop = self.identity_start[self.identity_row[a] : self.identity_row[a] + 2]
+        place = start + int(v * (stop - start))
+        first, last = self.pose_start[self.pose_of[place] : self.pose_of[place] + 2]
+        return self.members[a], self.of_pose[first + int(w * (last - first))], self.of_identity[place]
 
 
 def _groups(labels: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,17 +221,18 @@ def _groups(labels: Tensor) -> tuple[Tensor, Tensor]:
     return row, torch.cat([count.new_zeros(1), count.cumsum(0)])
 
 
-def _below(count: int, dice: torch.Generator) -> int:
-    return int(torch.randint(count, (), generator=dice))
+def _take(store: MeshStore, k: int, order: Tensor, verts: Tensor, faces: Tensor) -> Tensor:
+    """Write mesh k in another vertex order into the first rows; return where each of its vertices went."""
+    torch.index_select(store.view("verts", k), 0, order, out=verts[: len(order)])
+    rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
+    corners = store.view("faces", k).flatten()
+    torch.index_select(rank, 0, corners, out=faces.view(-1)[: len(corners)])
+    return rank
 
 
-def _inverse(order: Tensor) -> Tensor:
-    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
-
-
-def _centred(verts: Tensor) -> Tensor:
-    low, high = verts.aminmax(dim=0)
-    return verts - (low + high) / 2
+def _shift(verts: Tensor, centers: Tensor, mask: Tensor | None) -> Tensor:
+    moved = verts.sub_(centers[:, None])
+    return moved if mask is None else moved.masked_fill_(~mask[..., None], 0)
 
 
 def _check_counts(store: MeshStore) -> None:

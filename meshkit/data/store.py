@@ -20,7 +20,7 @@ from meshkit.io import MeshFileError, atomic_write, load_mesh
 
 __all__ = ["MeshStore"]
 
-_FORMAT = 1
+_FORMAT = 2
 _OPEN_MAPS = 64
 
 
@@ -38,6 +38,8 @@ class MeshStore:
         identity: ``(P,)`` identity of each.
         pose: ``(P,)`` pose of each.
         num_verts: ``(P,)`` vertex counts.
+        num_faces: ``(P,)`` face counts.
+        center: ``(P, 3)`` float32 middle of the bounding box of each.
         topology: ``(P,)`` number of the face list: meshes with equal ones are taken to be registered to each other.
         shard: ``(P,)`` shard that holds each.
         skipped: names of files that could not be read, with the reason.
@@ -64,7 +66,7 @@ class MeshStore:
             if index["format"] != _FORMAT:
                 raise ValueError(f"format {index['format']}, not {_FORMAT}")
             rows = np.array(index["rows"], dtype=np.int64).reshape(-1, 8)
-            names = index["paths"]
+            names, _ = index["paths"], index["centers"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise MeshFileError(f"{self.cache}: no store of meshes in it ({error}); build it") from error
         missing = [k for k in range(rows[:, 3].max(initial=-1) + 1) if not self._file("verts", k).is_file()]
@@ -77,7 +79,9 @@ class MeshStore:
         self.identity, self.pose, self.topology, self.shard = torch.from_numpy(rows[:, :4].T.copy())
         self._spans = rows[:, 4:]
         self.num_verts = torch.from_numpy(self._spans[:, 1] - self._spans[:, 0])
-        self._maps: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
+        self.num_faces = torch.from_numpy(self._spans[:, 3] - self._spans[:, 2])
+        self.center = torch.tensor(index["centers"]).view(-1, 3)
+        self._maps: OrderedDict[tuple[str, int], Tensor] = OrderedDict()
 
     @classmethod
     def build(
@@ -121,6 +125,7 @@ class MeshStore:
             stale.unlink()
         rows: list[list[int]] = []
         paths: list[str] = []
+        centers: list[list[float]] = []
         skipped: list[tuple[str, str]] = []
         topologies: dict[bytes, int] = {}
         shard = _Shard(cache, 0)
@@ -136,13 +141,14 @@ class MeshStore:
             topology = topologies.setdefault(digest, len(topologies))
             rows.append([entry.identity, entry.pose, topology, shard.number, *shard.add(verts, faces, topology)])
             paths.append(str(entry.path))
+            centers.append(((verts.min(0) + verts.max(0)) / 2).tolist())
             if shard.size >= shard_bytes:
                 shard.write()
                 shard = _Shard(cache, shard.number + 1)
         if not rows:
             raise MeshFileError(f"none of the {len(entries)} files could be read, the first: {skipped[0][1]}")
         shard.write()
-        index = {"format": _FORMAT, "key": key, "rows": rows, "paths": paths, "skipped": skipped}
+        index = {"format": _FORMAT, "key": key, "rows": rows, "paths": paths, "centers": centers, "skipped": skipped}
         with atomic_write(cache / "index.json") as temporary:
             temporary.write_text(json.dumps(index))
         if skipped:
@@ -155,20 +161,24 @@ class MeshStore:
 
     def verts(self, k: int) -> Tensor:
         """Vertices ``(N, 3)`` float32 of mesh k, in the order of its file."""
-        return torch.from_numpy(np.array(self._map("verts", int(self.shard[k]))[slice(*self._spans[k, :2])]))
+        return self.view("verts", k).clone()
 
     def faces(self, k: int) -> Tensor:
         """Faces ``(F, 3)`` int64 of mesh k."""
-        part = self._map("faces", int(self.shard[k]))[slice(*self._spans[k, 2:])]
-        return torch.from_numpy(part.astype(np.int64))
+        return self.view("faces", k).long()
+
+    def view(self, kind: str, k: int) -> Tensor:
+        """``"verts"`` (float32) or ``"faces"`` (int32) of mesh k, not copied: pages of the file, until written to."""
+        begin, end = self._spans[k, :2] if kind == "verts" else self._spans[k, 2:]
+        return self._map(kind, int(self.shard[k]))[begin:end]
 
     def _file(self, kind: str, number: int) -> Path:
         return self.cache / f"{kind}-{number:05d}.npy"
 
-    def _map(self, kind: str, number: int) -> np.ndarray:
-        """A memory map, of which a limited number are kept open."""
+    def _map(self, kind: str, number: int) -> Tensor:
+        """A memory map, of which a limited number are kept open. What is written to it stays private."""
         if (kind, number) not in self._maps:
-            self._maps[kind, number] = np.load(self._file(kind, number), mmap_mode="r")
+            self._maps[kind, number] = torch.from_numpy(np.load(self._file(kind, number), mmap_mode="c"))
             if len(self._maps) > _OPEN_MAPS:
                 self._maps.popitem(last=False)
         self._maps.move_to_end((kind, number))
