@@ -140,22 +140,22 @@ class Run:
         self.saved = known["step"]
         return known | {"pairs_per_step": state.get("pairs_per_step")}
 
-    def log(self, step: int, **values: Any) -> None:
+    def log(self, record: dict[str, Any]) -> None:
         """A line of the log, and the same for TensorBoard where that is installed."""
         if not self.writes:
             return
         try:
             with self.log_file.open("a") as stream:
-                stream.write(json.dumps({"step": step, **values}) + "\n")
+                stream.write(json.dumps(record) + "\n")
             if self._board is None and importlib.util.find_spec("tensorboard") is not None:
                 from torch.utils.tensorboard import SummaryWriter
 
                 # Points of an earlier life of the run that come after this step are forgotten.
-                self._board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=step)
+                self._board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=record["step"])
             if self._board is not None:
-                for name, value in (values | values.get("eval", {})).items():
+                for name, value in (record | record.get("eval", {})).items():
                     if isinstance(value, float):
-                        self._board.add_scalar(name, value, step)
+                        self._board.add_scalar(name, value, record["step"])
         except OSError as error:
             raise self._unwritable(self.log_file.name, error) from None
 

@@ -37,7 +37,8 @@ class Settings:
     """Where --apply writes the posed mesh."""
 
     data: str = "humans"
-    """What to train on: humans or animals, which ship with meshkit."""
+    """What to train on: humans or animals, which ship with meshkit; smpl:<file> or smal:<file>, a licensed model;
+    faust:<folder>, mgn:<folder>, or folder:<folder> of meshes named {identity}_{pose}.obj."""
     minutes: float | None = 8.0
     """Training time; turned into a number of steps once, by the measured speed, and recorded. Paper: 24 to 90 hours."""
     steps: int | None = None

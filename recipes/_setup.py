@@ -1,4 +1,4 @@
-"""What comes before training: checks of the configuration, the recorded one of a resumed run, and the data."""
+"""What comes before training: checks of the configuration, and the recorded one of a resumed run."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from _machine import world_size
-from _run import Run, UserError
+from _run import UserError
 
-from meshkit.data import MeshPool, PosePairs, load_shipped
 from meshkit.models import GeneratorConfig
 
 
@@ -68,39 +67,3 @@ def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = Non
             f"the run was begun with {pairs_per_step} pairs per step, which {processes} processes cannot share evenly"
         )
     return replace(begun, batch=batch, accumulate=pairs_per_step // (batch * processes))
-
-
-def data(cfg: Any, run: Run, workers: int) -> tuple[PosePairs, PosePairs]:
-    """Training pairs, and test pairs of unseen identities in unseen poses."""
-    body, split = load_shipped(cfg.data, cfg.vertices)
-    listed = split.test_pairs[: cfg.eval_pairs]
-    pools: dict[str, MeshPool | None] = {"train": None, "test": None}
-    if cfg.model.descriptors == "wks":
-        shared: dict[str, Any] = {"num_signatures": cfg.model.num_signatures, "workers": workers, "progress": True}
-        who, how = listed.view(-1, 2).unbind(1)
-        make = {
-            "train": lambda: MeshPool.build(
-                body, split.train_identities, split.train_poses, cfg.pool, seed=cfg.seed, **shared
-            ),
-            "test": lambda: MeshPool.of(body, who, how, **shared),
-        }
-        for side in pools:
-            key = f"{side}, {cfg.data}, {len(body.template)} vertices, {cfg.model.num_signatures} signatures, "
-            key += f"pool {cfg.pool}, seed {cfg.seed}" if side == "train" else f"{len(listed)} pairs"
-            stored = run.load_tensors(f"pool_{side}.safetensors", key)
-            if stored is None:
-                print(f"meshes to {side} on:", flush=True)
-                stored = make[side]().state_dict()
-                run.save_tensors(f"pool_{side}.safetensors", stored, key)
-            pools[side] = MeshPool(**stored)
-    train = PosePairs(
-        body,
-        split.train_identities,
-        split.train_poses,
-        length=cfg.pairs,
-        seed=cfg.seed,
-        resample=cfg.resample,
-        pool=pools["train"],
-        ground_truth=cfg.ground_truth,
-    )
-    return train, PosePairs(body, split.test_identities, split.test_poses, pool=pools["test"], listed=listed)

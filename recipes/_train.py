@@ -8,6 +8,7 @@ that is over. Each is written for one process; here any number of them work on p
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -15,12 +16,13 @@ from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
+from _data import data
 from _fabric import connect
 from _machine import keep_freed_memory
 from _report import evaluate, report
 from _run import Interruption, Run, UserError
 from _settings import Settings
-from _setup import check, data, resumed
+from _setup import check, resumed
 from _step import Diverged, Step, Trainer, count_steps
 from torch import nn
 from tqdm import tqdm
@@ -56,11 +58,12 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         torch.manual_seed(cfg.seed)
         generator, system = build(cfg)
         with fabric.rank_zero_first():
-            train_pairs, test_pairs = (side.to(fabric.device) for side in data(cfg, run, torch.get_num_threads()))
+            train_pairs, test_pairs = data(cfg, run, torch.get_num_threads(), fabric.device)
     except (ValueError, RuntimeError) as error:
         raise UserError(str(error)) from None
-    if train_pairs.pool is not None:
-        cast(Any, generator).fit_descriptors(train_pairs.pool.descriptors)
+    pool = getattr(train_pairs, "pool", None)
+    if pool is not None:
+        cast(Any, generator).fit_descriptors(pool.descriptors)
     fused = fabric.device.type == "cuda"  # elsewhere the fused form rounds differently and gains little
     optimizer = torch.optim.Adam(generator.parameters(), lr=cfg.lr, betas=cfg.betas, eps=cfg.adam_eps, fused=fused)
     if cfg.compile:
@@ -104,16 +107,17 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         try:
             losses = trainer.update(batch, s)
         except Diverged as error:
-            advice = "Training has diverged: begin again under another --name with a smaller --lr"
-            raise UserError(f"{error}; {run.last_checkpoint()}. {advice}") from None
+            advice = ". Training has diverged: begin again under another --name with a smaller --lr" if s else ""
+            raise UserError(f"{error}; {run.last_checkpoint()}{advice}") from None
         seconds, clock = seconds + time.perf_counter() - clock, time.perf_counter()
         bar.set_postfix({name: f"{value:.3g}" for name, value in losses.items()}, refresh=False)
         record: dict[str, Any] = {"step": s + 1, "seconds": round(seconds, 2), **losses}
         if (s + 1) % cfg.eval_every == 0 and s + 1 < steps and run.writes:
             few = min(24, len(test_pairs))
             record["eval"] = evaluate(generator, test_pairs, fabric.device, few)
-            bar.write(f"step {s + 1}: PMD {record['eval']['pmd']:.2f}e-3 on {few} unseen pairs")
-        run.log(**record)
+            score = record["eval"].get("pmd", math.nan)
+            bar.write(f"step {s + 1}: PMD {score:.2f}e-3 on {few} unseen pairs")
+        run.log(record)
         stop = interruption.wanted
         if (s + 1) % cfg.save_every == 0 or s + 1 == steps or stop:
             extra = {"seconds": seconds, "waiting": waiting, "pairs_per_step": pairs_per_step}

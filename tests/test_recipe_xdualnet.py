@@ -271,13 +271,13 @@ def test_a_damaged_file_is_named(copied: Path, refuse: Any, name: str, damage: s
     assert str(copied / name) in line
 
 
-def test_a_pool_of_another_configuration_is_not_reused(recipe: ModuleType, setup: ModuleType, tmp_path: Path) -> None:
+def test_a_pool_of_another_configuration_is_not_reused(recipe: ModuleType, tmp_path: Path) -> None:
     """A run killed before its first checkpoint may be begun anew with other values."""
     cfg = replace(recipe.PRESETS["tiny"], pool=3, eval_pairs=1)
-    run = setup.Run(tmp_path, resume=False)
-    setup.data(cfg, run, workers=1)
+    data, run = recipe_module("_data").data, recipe_module("_run").Run(tmp_path, resume=False)
+    data(cfg, run, workers=1)
     model = replace(cfg.model, num_signatures=4)
-    pairs, _ = setup.data(replace(cfg, seed=1, model=model), setup.Run(tmp_path, resume=False), workers=1)
+    pairs, _ = data(replace(cfg, seed=1, model=model), run, workers=1)
     split = human_split()
     fresh = MeshPool.build(
         load_humans(), split.train_identities, split.train_poses, 3, num_signatures=4, num_eigenpairs=5, seed=1

@@ -1,5 +1,8 @@
 """The other recipes: what they minimise, and that each runs from data to report."""
 
+import errno
+import math
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +15,9 @@ import torch
 from recipe_runs import read_json, read_log, recipe_module
 
 from meshkit.data import PairBatch, PosePairs, human_split, load_humans
+from meshkit.io import save_mesh
 from meshkit.models import GeneratorConfig, load_generator
+from meshkit.norm import SPAdaIN
 
 pytest.importorskip("tyro")
 pytest.importorskip("lightning_fabric")
@@ -87,3 +92,179 @@ def test_corenet3d_for_a_time_without_descriptors(run: Any) -> None:
     assert records[-1]["seconds"] < 10 * 0.02 * 60
     assert not list(folder.glob("pool_*"))
     assert load_generator(folder)[1].descriptors == "none"
+
+
+def test_corenet3d_with_spadain(run: Any) -> None:
+    folder = run("corenet3d", "--norm", "spadain", "--steps", 1, *WITHOUT_DESCRIPTORS, *SMALL_EXTRACTOR)
+    generator, model = load_generator(folder)
+    assert model.norm == "spadain"
+    assert all(isinstance(norm, SPAdaIN) for block in generator.transfer.blocks for norm in norms(block))
+
+
+def norms(block: torch.nn.Module) -> list[torch.nn.Module]:
+    return [block.norm_0, block.norm_1, block.norm_s]
+
+
+# NPT
+
+
+def test_npt_compares_with_the_truth(batch: PairBatch) -> None:
+    recipe = recipe_module("npt")
+    cfg = replace(recipe.PRESETS["tiny"], model=GeneratorConfig("npt_maxpool", extractor_widths=(8, 9)))
+    torch.manual_seed(0)
+    generator, system = recipe.build(cfg)
+    losses = {name: value.detach() for name, value in recipe.step(system, batch, cfg, 0.0).items()}
+    output = generator(batch.identity, batch.pose).vertices.detach()
+    expected = (output - batch.ground_truth).double().square().mean((1, 2)).mean()
+    assert float(losses["rec"]) == pytest.approx(float(expected), rel=1e-4)
+    penalty = mean_ratio_penalty(output, batch.identity, batch.identity_faces)
+    assert float(losses["edge"]) == pytest.approx(0.0005 * penalty, rel=1e-4)
+
+
+def test_npt_paper_preset_is_the_published_setting() -> None:
+    cfg = recipe_module("npt").PRESETS["paper"]
+    assert (cfg.lr, cfg.batch, cfg.steps) == (5e-5, 8, 1000 * cfg.pairs // 8)
+    assert (cfg.lambda_rec, cfg.lambda_edge) == (1.0, 0.0005)
+
+
+@pytest.mark.parametrize("variant", ["maxpool", "original"])
+def test_npt_trains(run: Any, variant: str) -> None:
+    folder = run("npt", "--variant", variant, "--steps", 2, "--model.extractor-widths", 8, 9)
+    assert load_generator(folder)[0].variant == variant
+    figures = read_json(folder / "summary.json")["test"]
+    assert set(figures) == {"pmd", "chamfer", "pmd_copy_identity", "chamfer_copy_identity"}
+
+
+# The baseline of cycles
+
+
+def test_cycle_baseline_asks_for_both_meshes_back(batch: PairBatch) -> None:
+    recipe = recipe_module("cycle_baseline")
+    cfg = small(recipe, lambda_self=500.0)
+    torch.manual_seed(0)
+    generator, system = recipe.build(cfg)
+    generator.eval()  # each pass moves the spectral norms' buffers
+    losses = {name: float(value.detach()) for name, value in recipe.step(system, batch, cfg, 0.0).items()}
+
+    def passed(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        return generator(a, b).vertices.detach()
+
+    a, b = batch.identity, batch.pose
+    ab, ba = passed(a, b), passed(b, a)
+    expected = {
+        "cycle_a": 2000 * (passed(ab, ba) - a).square().mean(),
+        "cycle_b": 2000 * (passed(ba, ab) - b).square().mean(),
+        "self": 500 * (passed(a, a) - a).square().mean(),
+    }
+    assert losses == {name: pytest.approx(float(value), rel=1e-3) for name, value in expected.items()}
+
+
+def test_cycle_baseline_trains(run: Any) -> None:
+    folder = run("cycle_baseline", "--steps", 1, *WITHOUT_DESCRIPTORS, *SMALL_EXTRACTOR, "--model.widths", 16, 8)
+    assert set(read_log(folder)[0]) == {"step", "seconds", "cycle_a", "cycle_b", "self", "loss"}
+
+
+# Data
+
+
+def body_files(folder: Path, identities: range, poses: range) -> Path:
+    body, other = load_humans(1000), load_humans(2000)
+    for who in identities:
+        for how in poses:
+            model = body if who % 2 else other
+            verts = model(torch.tensor([who]), torch.tensor([how]))[0]
+            save_mesh(folder / f"{who}_{how}.ply", verts, model.faces)
+    return folder
+
+
+FAST = ("--steps", 1, *WITHOUT_DESCRIPTORS, *SMALL_EXTRACTOR, "--model.widths", 8, 8)
+
+
+def test_meshes_of_different_sizes_from_a_folder(run: Any, tmp_path: Path) -> None:
+    place = body_files(tmp_path / "meshes", range(4), range(4))
+    folder = run("corenet3d", "--data", f"folder:{place}", "--eval-pairs", 1, *FAST)
+    assert read_json(folder / "summary.json")["test"]["pmd"] > 0
+    assert (folder / "sheet.png").exists()
+
+
+def test_unsupervised_training_on_meshes_without_ground_truth(run: Any, tmp_path: Path) -> None:
+    place = tmp_path / "wardrobe"
+    for who in range(10):
+        body = load_humans(1000)
+        verts = body(torch.tensor([who]), torch.tensor([who]))[0]
+        save_mesh(place / f"person{who}" / "smpl_registered.obj", verts, body.faces)
+    folder = run("xdualnet", "--data", f"mgn:{place}", "--points", "None", "--no-arap", *FAST)
+    assert read_json(folder / "summary.json")["test"].keys() == {"correspondence_m"}  # of one topology
+    assert not (folder / "meshes" / "pair0_ground_truth.obj").exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("cars", "must be humans, animals"),
+        ("humans:here", "must be humans, animals"),
+        ("folder", "must be humans, animals|there is no"),
+        ("faust:nowhere", "there is no nowhere"),
+        ("smpl:README.md", "cannot be read"),
+        ("folder:docs", "{identity}_{pose}"),
+    ],
+)
+def test_wrong_data_is_named(run: Any, word: str, said: str) -> None:
+    with pytest.raises(recipe_module("_run").UserError) as caught:
+        run("corenet3d", "--data", word, *FAST)
+    assert any(part in str(caught.value) for part in said.split("|")), str(caught.value)
+
+
+def test_files_and_signatures_do_not_go_together(run: Any, tmp_path: Path) -> None:
+    place = body_files(tmp_path / "meshes", range(1), range(1))
+    with pytest.raises(recipe_module("_run").UserError, match=r"--model\.descriptors none"):
+        run("corenet3d", "--data", f"folder:{place}", "--steps", 1)
+    with pytest.raises(recipe_module("_run").UserError, match="0 meshes to train on are too few, of 1"):
+        run("corenet3d", "--data", f"folder:{place}", *FAST)
+
+
+# Failures
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written, save = [], torch.save
+
+    def save_until_full(state: Any, path: Path) -> None:
+        save(state, path)
+        written.append(path)
+        if len(written) > 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(torch, "save", save_until_full)
+    arguments = ("corenet3d", "--save-every", 1, "--resume", *FAST, "--steps", 4)
+    with pytest.raises(recipe_module("_run").UserError) as caught:
+        run(*arguments)
+    folder, said = tmp_path / "run", str(caught.value)
+    assert "state.pt: No space left on device" in said and "after step 2, is usable" in said and "\n" not in said
+    assert torch.load(folder / "state.pt", weights_only=True)["step"] == 2
+    assert not [file for file in folder.iterdir() if file.name.startswith(".")]
+    monkeypatch.setattr(torch, "save", save)
+    run(*arguments)
+    assert [record["step"] for record in read_log(folder)] == [1, 2, 3, 4]
+
+
+def test_a_loss_that_is_nan_is_told_with_step_pairs_and_checkpoint(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, seen = recipe_module("corenet3d"), []
+    step = recipe.step
+
+    def step_until_nan(system: torch.nn.Module, batch: PairBatch, *others: Any) -> dict[str, torch.Tensor]:
+        seen.append(batch)
+        return {
+            name: loss * (math.nan if len(seen) == 4 else 1.0) for name, loss in step(system, batch, *others).items()
+        }
+
+    monkeypatch.setattr(recipe, "step", step_until_nan)
+    with pytest.raises(recipe_module("_run").UserError) as caught:
+        run("corenet3d", "--save-every", 2, *FAST, "--steps", 6)
+    said = str(caught.value)
+    assert "the loss is nan" in said and "at step 3 " in said and "after step 2, is usable" in said
+    assert str(seen[-1].identity_index.tolist()) in said and str(seen[-1].pose_index.tolist()) in said
+    state = torch.load(tmp_path / "run" / "state.pt", weights_only=True)
+    assert state["step"] == 2 and all(bool(value.isfinite().all()) for value in state["model"].values())
