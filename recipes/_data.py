@@ -26,7 +26,6 @@ from meshkit.data import (
     scan_mgn,
     scan_pose_transfer,
 )
-from meshkit.io import MeshFileError
 
 KINDS = "humans, animals, smpl:<file>, smal:<file>, faust:<folder>, mgn:<folder> or folder:<folder>"
 SCANNERS = {"faust": scan_faust, "mgn": scan_mgn, "folder": scan_pose_transfer}
@@ -44,7 +43,7 @@ def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -
         if kind in SCANNERS:
             return files(cfg, run, SCANNERS[kind](place))
         body, split = rigged(kind, Path(place)) if place else load_shipped(kind, cfg.vertices)
-    except MeshFileError as error:
+    except ValueError as error:
         raise UserError(f"--data {cfg.data}: {error}") from None
     train, test = posed(cfg, run, workers, body, split)
     return train.to(device), test.to(device)

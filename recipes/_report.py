@@ -28,7 +28,7 @@ def evaluate(generator: nn.Module, pairs: Pairs, device: torch.device, count: in
     together = 4 if isinstance(pairs, PosePairs) else 1  # meshes from files differ in size
     for start in range(0, count, together):
         batch = pairs[[(0, i) for i in range(start, min(start + together, count))]].to(device)
-        result = generate(generator, batch)
+        result = generate(generator, batch, start)
         candidates = {"": result.vertices, "_copy_identity": batch.identity}
         if result.warped is not None:
             candidates["_copy_warped"] = result.warped
@@ -42,7 +42,10 @@ def evaluate(generator: nn.Module, pairs: Pairs, device: torch.device, count: in
     return {name: round(float(torch.cat(values).mean()), 4) for name, values in columns.items()}
 
 
-def generate(generator: nn.Module, batch: PairBatch) -> Any:
+def generate(generator: nn.Module, batch: PairBatch, place: int) -> Any:
+    """The generator's result; one that is told more than the meshes takes the batch and its place among the pairs."""
+    if getattr(generator, "takes_batches", False):
+        return generator(batch, place)
     return generator(batch.identity, batch.pose, **inputs(batch))
 
 
@@ -101,7 +104,7 @@ def draw_sheet(run: Run, generator: nn.Module, pairs: Pairs, device: torch.devic
     worst, sheet, captions, titles = 0.15, [], [], [""]
     for b in range(min(rows, len(pairs))):
         batch = pairs[[(0, b)]].to(device)
-        result = generate(generator, batch)
+        result = generate(generator, batch, b)
         faces, output = batch.identity_faces[0], center(result.vertices)[0]
         views: dict[str, tuple[Tensor, Tensor, Any]] = {"identity": (batch.identity[0], faces, None)}
         views["pose"] = (batch.pose[0], batch.pose_faces[0], None)

@@ -64,7 +64,7 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
     pool = getattr(train_pairs, "pool", None)
     if pool is not None:
         cast(Any, generator).fit_descriptors(pool.descriptors)
-    fused = fabric.device.type == "cuda"  # elsewhere the fused form rounds differently and gains little
+    fused = fabric.device.type in ("cuda", "cpu")
     optimizer = torch.optim.Adam(generator.parameters(), lr=cfg.lr, betas=cfg.betas, eps=cfg.adam_eps, fused=fused)
     if cfg.compile:
         system = cast(nn.Module, torch.compile(system))

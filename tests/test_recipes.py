@@ -1,11 +1,12 @@
 """The other recipes: what they minimise, and that each runs from data to report."""
 
 import errno
+import json
 import math
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -164,6 +165,26 @@ def test_cycle_baseline_trains(run: Any) -> None:
     assert set(read_log(folder)[0]) == {"step", "seconds", "cycle_a", "cycle_b", "self", "loss"}
 
 
+# Deformation transfer
+
+
+@pytest.mark.parametrize("source", ["subject", "template"])
+def test_deformation_transfer_is_near_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str) -> None:
+    """Told the source in the identity's pose it must beat any copy by far; with the average body it is off by shape."""
+    words = ["x", "--out", tmp_path, "--name", "dt", "--eval-pairs", 3, "--source", source, "--threads", 1]
+    monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+    recipe_module("deformation_transfer").main()
+    figures = read_json(tmp_path / "dt" / "summary.json")["test"]
+    assert figures["pmd"] < figures["pmd_copy_identity"] * (0.02 if source == "subject" else 0.3)
+
+
+def test_deformation_transfer_needs_a_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for arguments, said in ((["--data", "folder:x"], "a rigged body is needed"), (["--eval-pairs", "0"], "400 test")):
+        monkeypatch.setattr(sys, "argv", ["x", "--out", str(tmp_path), *arguments])
+        with pytest.raises(recipe_module("_run").UserError, match=said):
+            recipe_module("deformation_transfer").main()
+
+
 # Data
 
 
@@ -268,3 +289,29 @@ def test_a_loss_that_is_nan_is_told_with_step_pairs_and_checkpoint(
     assert str(seen[-1].identity_index.tolist()) in said and str(seen[-1].pose_index.tolist()) in said
     state = torch.load(tmp_path / "run" / "state.pt", weights_only=True)
     assert state["step"] == 2 and all(bool(value.isfinite().all()) for value in state["model"].values())
+
+
+# Larger batches
+
+
+def test_accumulated_batches_equal_one_large_batch(run: Any) -> None:
+    """Without spectral normalisation, whose power iterations go on with every pass."""
+    logs = []
+    for name, sizes in (("large", (4, 1)), ("parts", (1, 4))):
+        batches = ("--batch", sizes[0], "--accumulate", sizes[1])
+        folder = run("corenet3d", *FAST, "--model.no-spectral", "--steps", 3, "--name", name, *batches).parent / name
+        logs.append([record["loss"] for record in read_log(folder)])
+        assert read_json(folder / "summary.json")["pairs_seen"] == 12
+    assert logs[0] == pytest.approx(logs[1], rel=1e-4)
+
+
+def test_another_number_of_processes_keeps_the_pairs_of_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    setup, cfg = recipe_module("_setup"), replace(recipe_module("corenet3d").PRESETS["tiny"], batch=2, accumulate=2)
+    recorded = json.dumps(asdict(cfg), default=str)
+    for processes, expected in ((1, (2, 4)), (2, (2, 2)), (4, (2, 1)), (8, (1, 1))):
+        monkeypatch.setenv("WORLD_SIZE", str(processes))
+        begun = setup.resumed(cfg, json.loads(recorded), 8)
+        assert (begun.batch, begun.accumulate) == expected
+    monkeypatch.setenv("WORLD_SIZE", "3")
+    with pytest.raises(recipe_module("_run").UserError, match="8 pairs per step, which 3 processes"):
+        setup.resumed(cfg, json.loads(recorded), 8)
