@@ -79,13 +79,12 @@ class Run:
         # torch and safetensors report a full disk as an error of their own, without saying why the write failed.
         full = shutil.disk_usage(self.folder).free < 1 << 20
         reason = getattr(error, "strerror", None) or ("No space left on device" if full else str(error).split("\n")[0])
-        place = self.folder / name
-        return UserError(f"cannot write {place}: {reason}; {self.last_checkpoint()}. Make room, then --resume")
+        said = f"cannot write {self.folder / name}: {reason}; {self.last_checkpoint()}"
+        return UserError(f"{said}. Make room, then --resume")
 
     def last_checkpoint(self) -> str:
-        if self.saved is None:
-            return "there is no checkpoint yet"
-        return f"the last checkpoint, {self.folder / 'state.pt'} after step {self.saved}, is usable"
+        usable = f"the last checkpoint, {self.folder / 'state.pt'} after step {self.saved}, is usable"
+        return "there is no checkpoint yet" if self.saved is None else usable
 
     def save_json(self, name: str, value: Any) -> None:
         if self.writes:
