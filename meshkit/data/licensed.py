@@ -40,7 +40,7 @@ def load_smpl(
         num_betas: shape directions to keep; ``None`` for all (newer files have 300).
         z_up: turn the body to meshkit's frame (z up, facing -y). Poses must then be turned as well:
             ``vectors @ torch.tensor(Y_UP_TO_Z_UP).T``.
-        max_bytes: larger files are refused. Reading needs about three times the file's size in memory.
+        max_bytes: larger files are refused. Reading takes less than twice the file's size in memory.
 
     Raises:
         MeshFileError: no such file, another extension, damaged, too large, arrays missing or of other shapes, or a
