@@ -26,7 +26,7 @@ MAX_BYTES = 1 << 30
 def load_smpl(
     path: str | os.PathLike[str], *, num_betas: int | None = 10, z_up: bool = False, max_bytes: int = MAX_BYTES
 ) -> RiggedModel:
-    """Read an SMPL model (or one of its layout: SMPL+H, STAR-like exports, SMAL without its data file).
+    """Read an SMPL model, or another of its layout, such as SMPL+H.
 
     Both published forms are read: ``.pkl``, pickled with Python 2 and chumpy, neither of which is needed, and ``.npz``.
     The pickle cannot run code: only arrays, sparse matrices and chumpy's containers are admitted.
