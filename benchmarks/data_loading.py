@@ -73,9 +73,9 @@ def reindex_in_a_loop(faces: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 def reindex(faces: Tensor, order: Tensor) -> Tensor:
-    """The same, as meshkit.data does it: invert the permutation by a scatter, look the corners up by a gather."""
+    """The same, as meshkit.data does it: invert the permutation by a scatter, then look the corners up in it."""
     rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
-    return rank.gather(0, faces.flatten()).view(-1, 3)
+    return rank.index_select(0, faces.flatten()).view(-1, 3)
 
 
 def released_pair(meshes: list[np.ndarray], faces: np.ndarray) -> tuple[object, ...]:
@@ -129,6 +129,7 @@ def against_released(args: argparse.Namespace) -> None:
             meshes = [pairs.store.verts(k).double().numpy() for k in range(3)]
             order = torch.randperm(len(verts))
             old_faces, old_order = faces.numpy().astype(np.int32), order.numpy()
+            faces = faces.int()  # as a store keeps them
             assert np.array_equal(reindex_in_a_loop(old_faces, old_order), reindex(faces, order).numpy())
             slow = median_ms(lambda f=old_faces, o=old_order: reindex_in_a_loop(f, o), args.repeats)
             fast = median_ms(lambda f=faces, o=order: [reindex(f, o) for _ in range(20)], args.repeats) / 20

@@ -271,6 +271,16 @@ def test_hand_written_pickles_come_to_nothing(name, tmp_path):
     assert not trap.exists()
 
 
+def test_objects_without_state_are_left_alone(tmp_path, chumpy, monkeypatch):
+    """An entry that nobody needs may be an object of chumpy that was stored bare."""
+    path = write_python2(tmp_path / "body.pkl", published(chumpy, spare=types.SimpleNamespace))
+    content = path.read_bytes().replace(b"ctypes\nSimpleNamespace\n", b"cchumpy.ch\nCh\n)\x81")
+    assert content != path.read_bytes()
+    path.write_bytes(content)
+    forget(monkeypatch)
+    assert load_smpl(path).template.shape == (V, 3)
+
+
 def test_containers_shared_many_times_do_not_grow(tmp_path):
     """A list of two of the list before it, forty times over: 80 entries in the file, a million million unfolded."""
     nest: list[object] = []

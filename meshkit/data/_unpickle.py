@@ -25,8 +25,12 @@ _KINDS = "biuf"  # booleans, integers and floats; no objects, no records
 class Record:
     """An object of a class we know but do not run: its state, as stored."""
 
-    def __init__(self, *_: Any) -> None:
-        self.state: dict[str, Any] = {}
+    state: dict[str, Any]
+
+    def __new__(cls, *_: Any) -> Record:  # pickles make objects without __init__
+        self = super().__new__(cls)
+        self.state = {}
+        return self
 
     def __setstate__(self, state: Any) -> None:
         self.state = state if isinstance(state, dict) else {"state": state}
@@ -47,8 +51,12 @@ class _DType:
 class Array:
     """A pickled NumPy array in the making; its buffer is in the file, so its size is bounded by the file's."""
 
-    def __init__(self, *_: Any) -> None:
-        self.value: np.ndarray = np.empty(0)
+    value: np.ndarray
+
+    def __new__(cls, *_: Any) -> Array:
+        self = super().__new__(cls)
+        self.value = np.empty(0)
+        return self
 
     def __setstate__(self, state: Any) -> None:
         _, shape, dtype, fortran, raw = state

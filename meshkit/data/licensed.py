@@ -26,7 +26,7 @@ MAX_BYTES = 1 << 30
 def load_smpl(
     path: str | os.PathLike[str], *, num_betas: int | None = 10, z_up: bool = False, max_bytes: int = MAX_BYTES
 ) -> RiggedModel:
-    """Read an SMPL model (or one of its layout: SMPL+H, STAR-like exports, SMAL without its data file).
+    """Read an SMPL model, or another of its layout, such as SMPL+H.
 
     Both published forms are read: ``.pkl``, pickled with Python 2 and chumpy, neither of which is needed, and ``.npz``.
     The pickle cannot run code: only arrays, sparse matrices and chumpy's containers are admitted.
@@ -40,7 +40,7 @@ def load_smpl(
         num_betas: shape directions to keep; ``None`` for all (newer files have 300).
         z_up: turn the body to meshkit's frame (z up, facing -y). Poses must then be turned as well:
             ``vectors @ torch.tensor(Y_UP_TO_Z_UP).T``.
-        max_bytes: larger files are refused. Reading needs about three times the file's size in memory.
+        max_bytes: larger files are refused. Reading takes less than twice the file's size in memory.
 
     Raises:
         MeshFileError: no such file, another extension, damaged, too large, arrays missing or of other shapes, or a
