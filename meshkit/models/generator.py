@@ -18,9 +18,12 @@ from meshkit.models.pointwise import PointwiseExtractor
 from meshkit.models.stack import PoseTransferStack
 from meshkit.models.symmetry import mirror_labels
 from meshkit.nn import SetConvExtractor
+from meshkit.norm import ConditionalNorm, ElaIN, SPAdaIN
 from meshkit.ot import TransportPlan, sinkhorn
 
 __all__ = ["GeneratorOutput", "PoseTransferGenerator"]
+
+_NORMS: dict[str, type[ConditionalNorm]] = {"elain": ElaIN, "spadain": SPAdaIN}
 
 
 class PoseTransferGenerator(nn.Module):
@@ -47,6 +50,8 @@ class PoseTransferGenerator(nn.Module):
             reconstruction rebuilds B from B, the blocks can copy it, and never learn to transfer a shape.
         eps: entropic regularisation of the matching.
         n_iters: Sinkhorn iterations.
+        norm: conditional norm of the blocks, ``"elain"`` or, for the paper's ablation, ``"spadain"``
+            (:class:`~meshkit.norm.SPAdaIN`), which takes scale and shift from the condition alone.
         spectral: spectral normalisation in the blocks.
         residual: the output is the warped mesh plus a learned displacement.
         rigid_radius: if given, the warped mesh passes through
@@ -94,6 +99,7 @@ class PoseTransferGenerator(nn.Module):
         widths: Sequence[int] = (1024, 512, 256),
         eps: float = 0.03,
         n_iters: int = 5,
+        norm: str = "elain",
         spectral: bool = True,
         residual: bool = False,
         condition: str = "features",
@@ -112,6 +118,8 @@ class PoseTransferGenerator(nn.Module):
             raise ValueError(f'extractor must be "setconv" or "pointwise", got {extractor!r}')
         if condition not in ("features", "descriptors"):
             raise ValueError(f'condition must be "features" or "descriptors", got {condition!r}')
+        if norm not in _NORMS:
+            raise ValueError(f'norm must be "elain" or "spadain", got {norm!r}')
         if (condition == "descriptors" or match_size) and descriptors == 0:
             raise ValueError('condition="descriptors" and match_size need descriptors: give their number of channels')
         self.eps, self.n_iters, self.normalize_plan = eps, n_iters, normalize_plan
@@ -129,7 +137,7 @@ class PoseTransferGenerator(nn.Module):
         stack = OrderedPoseTransferStack if released else PoseTransferStack
         self.released = released
         cond_features = features if condition == "features" else descriptors
-        self.transfer = stack(cond_features, widths, spectral=spectral, residual=residual)
+        self.transfer = stack(cond_features, widths, norm=_NORMS[norm], spectral=spectral, residual=residual)
         self.register_buffer("descriptor_mean", torch.zeros(descriptors))
         self.register_buffer("descriptor_std", torch.ones(descriptors))
         self.reset_parameters()

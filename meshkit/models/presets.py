@@ -38,6 +38,8 @@ class GeneratorConfig:
     """Entropic regularisation of the matching. Paper: 0.03."""
     n_iters: int = 5
     """Sinkhorn iterations. Paper: 5."""
+    norm: str = "elain"
+    """Conditional norm of the blocks: elain, or spadain, with which the paper compares it."""
     spectral: bool = True
     """Spectral normalisation in the blocks. Released code: yes."""
     residual: bool = False
