@@ -32,7 +32,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "consistency": FOUNDATION | {"ot", "losses", "deform"},
     "models": FOUNDATION
     | {"nn", "norm", "ot", "deform", "descriptors", "io"},  # io: checkpoints are written atomically
-    "io": set(),
+    "io": FOUNDATION,
     "viz": {"io"},
     "data": FOUNDATION | {"io", "descriptors"},
 }

@@ -6,9 +6,6 @@ and repeat vertices along texture seams. PLY, STL and GLB go through trimesh.
 """
 
 import os
-import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,45 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["MeshFileError", "atomic_write", "load_mesh", "save_mesh"]
+from meshkit.io.atomic import atomic_write
+
+__all__ = ["MeshFileError", "load_mesh", "save_mesh"]
 
 _EXTENSIONS = (".glb", ".obj", ".off", ".ply", ".stl")
 
 
 class MeshFileError(ValueError):
     """A file that is not a usable mesh; the message names the file and says what is wrong with it."""
-
-
-@contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Replace ``path`` as a whole or not at all: a reader, or a crash half-way, never sees half a file.
-
-    Write to the path that the context yields. It lies in the same folder (made if missing) and has the same suffix, so
-    that writers which look at the suffix work; on leaving the context it is renamed over ``path``. An exception removes
-    it and leaves ``path`` as it was.
-
-    Args:
-        path: the file to write.
-
-    Yields:
-        Temporary path to write to.
-
-    Example:
-        >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> with atomic_write(folder / "runs" / "log.txt") as temporary:
-        ...     _ = temporary.write_text("done")
-        >>> (folder / "runs" / "log.txt").read_text()
-        'done'
-    """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def load_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
