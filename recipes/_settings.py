@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import tyro
 
@@ -18,6 +18,9 @@ Preset = Literal["tiny", "small", "paper"]
 @dataclass(frozen=True)
 class Settings:
     """What a run depends on besides its losses. The values are those of the preset; comments give the paper's."""
+
+    ground_truth: ClassVar[bool] = True
+    """Whether training looks at the ground truth; without, it need not be made."""
 
     preset: Preset = "tiny"
     """tiny trains on a CPU in minutes, small in hours, or on a GPU in minutes; paper has the printed sizes."""

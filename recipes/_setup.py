@@ -75,5 +75,6 @@ def data(cfg: Any, run: Run, workers: int) -> tuple[PosePairs, PosePairs]:
         seed=cfg.seed,
         resample=cfg.resample,
         pool=pools["train"],
+        ground_truth=cfg.ground_truth,
     )
     return train, PosePairs(body, split.test_identities, split.test_poses, pool=pools["test"], listed=listed)

@@ -109,7 +109,7 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         fabric = Fabric(accelerator=cfg.accelerator, devices=1, precision=cast(Any, cfg.precision))
         torch.manual_seed(cfg.seed)
         generator, system = build(cfg)
-        train_pairs, test_pairs = data(cfg, run, workers=torch.get_num_threads())
+        train_pairs, test_pairs = (side.to(fabric.device) for side in data(cfg, run, torch.get_num_threads()))
     except (ValueError, RuntimeError) as error:
         raise UserError(str(error)) from None
     if train_pairs.pool is not None:

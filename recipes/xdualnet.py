@@ -13,7 +13,7 @@ summary.json. A killed run goes on with --resume.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from _apply import apply
@@ -32,6 +32,8 @@ from meshkit.models.presets import PRESETS as MODELS
 @dataclass(frozen=True)
 class Config(Settings):
     """X-DualNet's settings."""
+
+    ground_truth: ClassVar[bool] = False
 
     name: str = "xdualnet"
     """Name of the run."""

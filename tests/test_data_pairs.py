@@ -1,11 +1,15 @@
 """Pairs, pools, samplers and loaders: reproducible, with ground truth checked through geometry."""
 
+from dataclasses import replace
+
 import pytest
 import torch
+from conftest import rand
 from literal_data import (
     assert_same,
     centred,
     nearest,
+    parts,
     stack,
     synthetic_rig,
 )
@@ -21,6 +25,7 @@ from meshkit.data import (
     RiggedModel,
     human_split,
     load_humans,
+    load_shipped,
     pair_loader,
 )
 from meshkit.descriptors import wave_kernel_signature
@@ -271,6 +276,98 @@ def test_pairs_without_pool_have_no_descriptors(humans):
     batch = PosePairs(humans, torch.arange(2), torch.arange(2))[(0, 0)]
     assert batch.identity_descriptors is None
     assert batch.pose_descriptors is None
+
+
+# Devices, noise, no ground truth
+
+
+@pytest.mark.parametrize("name", ["humans", "animals"])
+@pytest.mark.parametrize("pooled", [False, True])
+def test_pairs_without_ground_truth_are_the_same_otherwise(name, pooled):
+    model, split = load_shipped(name)
+    who, how = split.test_identities, split.test_poses
+    pool = MeshPool.build(model, who, how, 3, num_signatures=2, num_eigenpairs=4) if pooled else None
+    full = PosePairs(model, who, how, pool=pool)[[(0, 0), (2, 5)]]
+    bare = PosePairs(model, who, how, pool=pool, ground_truth=False)[[(0, 0), (2, 5)]]
+    assert bare.ground_truth.shape == (2, 0, 3)
+    assert full.ground_truth.shape == full.identity.shape
+    assert_same(replace(full, ground_truth=bare.ground_truth), bare)
+
+
+def test_pool_pairs_are_two_different_meshes():
+    model = synthetic_rig().float()
+    pool = MeshPool(torch.arange(5) % 4, torch.arange(5), rand(5, 12, 3).float(), torch.zeros(5, 12, 1))
+    pairs = PosePairs(model, torch.arange(4), torch.arange(5), pool=pool, shuffle=False)
+    batch = pairs[[(0, i) for i in range(400)]]
+    first = (batch.identity[:, None] - center(pool.verts)).abs().amax((2, 3)).argmin(1)
+    second = (batch.pose[:, None] - center(pool.verts)).abs().amax((2, 3)).argmin(1)
+    assert (first != second).all()
+    counts = torch.bincount(5 * first + second, minlength=25).view(5, 5)
+    expected = 20 * (1 - torch.eye(5))  # 400 draws over 20 ordered pairs
+    chi_squared = ((counts - expected).square() / expected)[expected > 0].sum()
+    assert chi_squared < 57  # the 0.99999 quantile for 19 degrees of freedom
+
+
+def test_pose_noise_is_of_the_stated_size_and_on_the_pose_mesh_alone(humans):
+    arguments = (humans, torch.arange(5), torch.arange(5))
+    clean = PosePairs(*arguments)[[(0, 0), (1, 3)]]
+    noisy = PosePairs(*arguments, pose_noise=0.02)[[(0, 0), (1, 3)]]
+    assert_same(replace(noisy, pose=clean.pose), clean)
+    difference = noisy.pose - clean.pose
+    difference = difference - difference.mean(1, keepdim=True)  # the noise moves the bounding box
+    assert abs(difference.std() - 0.02) < 5e-4
+    assert difference[0].sub(difference[1]).abs().max() > 0.05  # drawn per item
+    assert bounding_box_center(noisy.pose).abs().max() < 1e-6
+    again = PosePairs(*arguments, pose_noise=0.02)[(1, 3)]
+    torch.testing.assert_close(again.pose[0], noisy.pose[1], rtol=0, atol=1e-6)
+
+
+def test_pairs_move_to_a_device_and_leave_the_original(humans, pool):
+    for chosen in (None, pool):
+        pairs = PosePairs(humans, torch.arange(5), torch.arange(5), pool=chosen)
+        there = pairs.to("meta")
+        assert there.device.type == "meta" and pairs.device.type == "cpu" and humans.template.device.type == "cpu"
+        batch, here = there[[(0, 0), (0, 1)]], pairs[[(0, 0), (0, 1)]]
+        for name in PairBatch.__dataclass_fields__:
+            value, twin = getattr(batch, name), getattr(here, name)
+            assert (value is None) == (twin is None)
+            if value is not None:
+                assert value.device.type == "meta" and value.shape == twin.shape and value.dtype == twin.dtype, name
+        with pytest.raises(ValueError, match="pairs on meta are made by this process: use workers=0, got 2"):
+            pair_loader(there, PairSampler(10, 2, stop=1), workers=2)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("name", ["humans", "animals"])
+def test_batches_are_the_same_on_the_gpu(name):
+    model, split = load_shipped(name)
+    pool = MeshPool.build(model, split.test_identities, split.test_poses, 3, num_signatures=2, num_eigenpairs=4)
+    for chosen in (None, pool):
+        pairs = PosePairs(model, split.test_identities, split.test_poses, pool=chosen, length=20)
+        there = pairs.to("cuda")
+        for addresses in PairSampler(20, 4, stop=5):
+            batch = there[addresses]
+            assert batch.identity.is_cuda
+            assert_same(batch.to("cpu"), pairs[addresses])
+        assert next(iter(pair_loader(there, PairSampler(20, 4, stop=5)))).identity.is_cuda
+    pinned = next(iter(pair_loader(pairs, PairSampler(20, 4, stop=5), pin_memory=True)))
+    assert pinned.identity.is_pinned()
+
+
+def test_what_pairs_refuse(humans, pool):
+    few = torch.arange(3)
+    with pytest.raises(ValueError, match=r"identities must be in \[0, 200\), got 0 to 200"):
+        PosePairs(humans, torch.tensor([0, 200]), few)
+    with pytest.raises(ValueError, match=r"poses must be in \[0, 1000\), got -1 to 2"):
+        PosePairs(humans, few, torch.tensor([-1, 2]))
+    with pytest.raises(ValueError, match=r"identities must be in \[0, 200\), got 0 to 300"):
+        PosePairs(humans, few, few, listed=torch.tensor([[0, 1, 300, 2]]))
+    with pytest.raises(ValueError, match=r"got -0.1"):
+        PosePairs(humans, few, few, pose_noise=-0.1)
+    with pytest.raises(ValueError, match=r"0 with a pool, whose descriptors are of clean meshes; got 0.1"):
+        PosePairs(humans, few, few, pose_noise=0.1, pool=pool)
+    with pytest.raises(ValueError, match="no tables of identities and poses to draw from"):
+        PosePairs(RiggedModel(**parts(synthetic_rig())), few, few)
 
 
 # Sampler and loader

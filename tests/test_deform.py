@@ -525,7 +525,7 @@ def with_nan(tensor: torch.Tensor) -> torch.Tensor:
         ({"grad": "unroll"}, 'grad="unroll" needs method="local_global"'),
         ({"grad_tol": 0.0}, r"grad_tol must be in \(0, 1\), got 0.0"),
         ({"method": "newton"}, "method must be one of lbfgs, local_global; got 'newton'"),
-        ({"solver": "lu"}, "solver must be one of splu, qdldl, cholespy, pcg; got 'lu'"),
+        ({"solver": "lu"}, "solver must be one of auto, splu, qdldl, cholespy, pcg, dense; got 'lu'"),
         ({"degenerate": "fix"}, "degenerate must be one of raise, ignore; got 'fix'"),
         ({"soft_targets": VERTS}, "belong together; soft_weights is missing"),
         ({"soft_weights": WEIGHTS}, "belong together; soft_targets is missing"),

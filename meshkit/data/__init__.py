@@ -9,9 +9,11 @@ from meshkit.data.assets import (
     load_humans,
     load_shipped,
 )
-from meshkit.data.pairs import PairBatch, PairSampler, PosePairs, pair_loader
+from meshkit.data.batch import PairBatch
+from meshkit.data.pairs import PosePairs
 from meshkit.data.pool import MeshPool
 from meshkit.data.rigged import RiggedModel, rotation_matrices
+from meshkit.data.sampler import PairSampler, pair_loader
 
 __all__ = [
     "MeshPool",

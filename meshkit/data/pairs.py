@@ -1,59 +1,23 @@
-"""Pairs of posed meshes with ground truth."""
+"""Pairs of posed bodies with ground truth, generated on the fly."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+import copy
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import Dataset
 
 from meshkit.batching import center
+from meshkit.data.batch import PairBatch
 from meshkit.data.pool import MeshPool
 from meshkit.data.rigged import RiggedModel
+from meshkit.data.sampler import seeded
 from meshkit.neighbors import gather_vertices
 
-__all__ = ["PairBatch", "PairSampler", "PosePairs", "pair_loader"]
-
-
-@dataclass(frozen=True)
-class PairBatch:
-    """A batch of (identity mesh, pose mesh, ground truth).
-
-    Args:
-        identity: ``(B, N, 3)`` mesh that gives the body.
-        identity_faces: ``(B, F, 3)``.
-        pose: ``(B, M, 3)`` mesh that gives the pose.
-        pose_faces: ``(B, G, 3)``.
-        ground_truth: ``(B, N, 3)`` body of the one in the pose of the other, in the identity's vertex order.
-        correspondence: ``(B, N)`` vertex of the pose mesh that is the same point of the body.
-        identity_index: ``(B,)`` identity of the body.
-        pose_index: ``(B,)`` pose of the ground truth.
-        identity_descriptors: ``(B, N, D)`` or ``None``.
-        pose_descriptors: ``(B, M, D)`` or ``None``.
-    """
-
-    identity: Tensor
-    identity_faces: Tensor
-    pose: Tensor
-    pose_faces: Tensor
-    ground_truth: Tensor
-    correspondence: Tensor
-    identity_index: Tensor
-    pose_index: Tensor
-    identity_descriptors: Tensor | None = None
-    pose_descriptors: Tensor | None = None
-
-    def to(self, device: torch.device | str) -> PairBatch:
-        """The batch on another device."""
-        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        moved: dict[str, Any] = {k: None if v is None else v.to(device) for k, v in values.items()}
-        return PairBatch(**moved)
-
-    def __len__(self) -> int:
-        return len(self.identity)
+__all__ = ["PosePairs"]
 
 
 class PosePairs(Dataset[PairBatch]):
@@ -62,11 +26,14 @@ class PosePairs(Dataset[PairBatch]):
     An item is addressed by ``(epoch, i)`` and depends on nothing else: not on the worker, the batch it falls into, or
     what was read before. Indexing with a list of such addresses evaluates the whole batch at once.
 
+    :meth:`to` moves body and pool to a GPU, and batches are then made there. Random numbers are drawn on the CPU all
+    the same, so a batch is the same on every device, up to the rounding of coordinates.
+
     Each mesh is centred by its bounding box. Identity and pose meshes get independent random vertex orders; faces are
     re-indexed to match, and the ground truth follows the identity's order.
 
     Args:
-        model: body with tables of identities and poses, on the CPU, where pairs are drawn; move the batch afterwards.
+        model: body with tables of identities and poses.
         identities: allowed identity indices.
         poses: allowed pose indices.
         length: pairs per epoch.
@@ -77,9 +44,14 @@ class PosePairs(Dataset[PairBatch]):
         pool: take input meshes with their descriptors from this pool. Its identities and poses replace the two lists.
         listed: ``(L, 4)`` identity and pose of the first mesh, identity and pose of the second: these pairs instead of
             random ones, ``i`` being the row. A pool must then hold their meshes in this order, two per row.
+        ground_truth: evaluate the ground truth. Unsupervised training does without, and saves a third of the work, or
+            with a pool most of it; ``PairBatch.ground_truth`` is then empty.
+        pose_noise: standard deviation of normal noise on the vertices of the pose mesh, in the unit of the model,
+            added before centring; the paper's test of robustness. The ground truth stays clean.
 
     Raises:
-        ValueError: an empty list, or a length below 1.
+        ValueError: an empty list, a length below 1, indices beyond the model's tables, a model without tables,
+            negative noise, or noise with a pool, whose descriptors are of clean meshes.
 
     Reference:
         X-DualNet, "Datasets": 6400 pairs, vertices shuffled, bounding-box centring.
@@ -105,132 +77,128 @@ class PosePairs(Dataset[PairBatch]):
         shuffle: bool = True,
         pool: MeshPool | None = None,
         listed: Tensor | None = None,
+        ground_truth: bool = True,
+        pose_noise: float = 0.0,
     ) -> None:
         if len(identities) == 0 or len(poses) == 0 or length < 1:
             raise ValueError(
                 f"need identities, poses and a positive length, got {len(identities)}, {len(poses)} and {length}"
             )
-        self.model, self.identities, self.poses, self.pool = model, identities, poses, pool
+        if model.identities is None or model.poses is None:
+            raise ValueError("the model has no tables of identities and poses to draw from: give it both")
+        # Checked here, once: the tables are then indexed without asking the device for the smallest and largest index.
+        listed_who, listed_how = (identities, poses) if listed is None else (listed[:, ::2], listed[:, 1::2])
+        for name, table, used in (
+            ("identities", model.identities, (identities, listed_who)),
+            ("poses", model.poses, (poses, listed_how)),
+        ):
+            low, high = min(int(x.min()) for x in used), max(int(x.max()) for x in used)
+            if not 0 <= low <= high < len(table):
+                raise ValueError(f"{name} must be in [0, {len(table)}), got {low} to {high}")
+        if pose_noise < 0 or (pose_noise > 0 and pool is not None):
+            raise ValueError(
+                f"pose_noise must be >= 0, and 0 with a pool, whose descriptors are of clean meshes; got {pose_noise}"
+            )
+        self.model, self.pool = model, pool
+        self.identities, self.poses = identities.cpu(), poses.cpu()
         self.length = length if listed is None else len(listed)
-        self.seed, self.resample, self.shuffle, self.listed = seed, resample, shuffle, listed
+        self.listed = None if listed is None else listed.cpu()
+        self.seed, self.resample, self.shuffle = seed, resample, shuffle
+        self.ground_truth, self.pose_noise = ground_truth, pose_noise
+
+    @property
+    def device(self) -> torch.device:
+        """Where batches are made."""
+        return self.model.template.device
+
+    def to(self, device: torch.device | str) -> PosePairs:
+        """The same pairs, made on another device; this object and its model stay as they are."""
+        moved = copy.copy(self)
+        moved.model = copy.deepcopy(self.model).to(device)
+        moved.pool = None if self.pool is None else self.pool.to(device)
+        return moved
 
     def __len__(self) -> int:
         return self.length
 
+    @torch.no_grad()
     def __getitem__(self, address: tuple[int, int] | Sequence[tuple[int, int]]) -> PairBatch:
         """The pairs at one or several ``(epoch, i)``, as a batch."""
-        if isinstance(address, tuple):
-            address = [address]
-        draws = [self._draw(epoch, i) for epoch, i in address]
-        first, second, order_a, order_b = (torch.stack(column) for column in zip(*draws, strict=True))
-        with torch.no_grad():
-            return self._assemble(first, second, order_a, order_b)
+        addresses = [address] if isinstance(address, tuple) else address
+        meshes, orders, noise = self._draw(addresses)
+        return self._assemble(
+            meshes.to(self.device, non_blocking=True),
+            orders.to(self.device, non_blocking=True),
+            None if noise is None else noise.to(self.device, non_blocking=True),
+        )
 
-    def _draw(self, epoch: int, i: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Two meshes, each an (identity, pose) or a place in the pool, and two vertex orders."""
-        what = _generator(self.seed, epoch if self.resample else 0, i)
-        if self.listed is not None:
-            first, second = self.listed[i].split(2) if self.pool is None else torch.tensor([[2 * i], [2 * i + 1]])
-        elif self.pool is None:
-            who = self.identities[torch.randint(len(self.identities), (2,), generator=what)]
-            how = self.poses[torch.randint(len(self.poses), (2,), generator=what)]
-            first, second = torch.stack([who, how], 1)
-        else:
-            first, second = torch.randperm(len(self.pool), generator=what)[:2, None]
-        num = len(self.model.template)
-        if not self.shuffle:
-            return first, second, torch.arange(num), torch.arange(num)
-        order = _generator(self.seed + 1, epoch, i)
-        return first, second, torch.randperm(num, generator=order), torch.randperm(num, generator=order)
+    def _draw(self, addresses: Sequence[tuple[int, int]]) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Two meshes ``(2, B, 1 or 2)``, places in the pool or (identity, pose); vertex orders ``(2, B, N)``; noise."""
+        batch, num, dice = len(addresses), len(self.model.template), torch.Generator()
+        meshes = torch.empty(2, batch, 2 if self.pool is None else 1, dtype=torch.int64)
+        orders = torch.arange(num).repeat(2, batch, 1)
+        noise = torch.empty(batch, num, 3) if self.pose_noise > 0 else None
+        for b, (epoch, i) in enumerate(addresses):
+            if self.listed is None:
+                self._pick(meshes[:, b], seeded(dice, self.seed, epoch if self.resample else 0, i))
+            elif self.pool is None:
+                meshes[:, b] = self.listed[i].view(2, 2)
+            else:
+                meshes[:, b, 0] = torch.tensor([2 * i, 2 * i + 1])
+            if self.shuffle:
+                seeded(dice, self.seed + 1, epoch, i)
+                torch.randperm(num, generator=dice, out=orders[0, b])
+                torch.randperm(num, generator=dice, out=orders[1, b])
+            if noise is not None:
+                torch.randn(num, 3, generator=seeded(dice, self.seed + 3, epoch, i), out=noise[b])
+        return meshes, orders, noise
 
-    def _assemble(self, first: Tensor, second: Tensor, order_a: Tensor, order_b: Tensor) -> PairBatch:
-        descriptors: dict[str, Any] = {}
+    def _pick(self, meshes: Tensor, dice: torch.Generator) -> None:
         if self.pool is None:
-            (who_a, how_a), (who_b, how_b) = first.unbind(1), second.unbind(1)
-            meshes = self.model(torch.cat([who_a, who_b, who_a]), torch.cat([how_a, how_b, how_b]))
-            mesh_a, mesh_b, truth = meshes.chunk(3)
+            meshes[:, 0] = self.identities[torch.randint(len(self.identities), (2,), generator=dice)]
+            meshes[:, 1] = self.poses[torch.randint(len(self.poses), (2,), generator=dice)]
+        else:  # two different meshes: the second is drawn from the others
+            a = int(torch.randint(len(self.pool), (), generator=dice))
+            b = int(torch.randint(len(self.pool) - 1, (), generator=dice))
+            meshes[0, 0], meshes[1, 0] = a, b + (b >= a)
+
+    def _assemble(self, meshes: Tensor, orders: Tensor, noise: Tensor | None) -> PairBatch:
+        descriptors: dict[str, Any] = {}
+        order_a, order_b = orders
+        truth: Tensor | None = None
+        if self.pool is None:
+            (who_a, how_a), (who_b, how_b) = meshes[0].unbind(1), meshes[1].unbind(1)
+            if self.ground_truth:
+                body = self._body(torch.cat([who_a, who_b, who_a]), torch.cat([how_a, how_b, how_b]))
+                mesh_a, mesh_b, truth = body.chunk(3)
+            else:
+                mesh_a, mesh_b = self._body(torch.cat([who_a, who_b]), torch.cat([how_a, how_b])).chunk(2)
         else:
-            a, b = first[:, 0], second[:, 0]
+            a, b = meshes[..., 0]
             who_a, how_b = self.pool.identity[a], self.pool.pose[b]
-            mesh_a, mesh_b, truth = self.pool.verts[a], self.pool.verts[b], self.model(who_a, how_b)
+            mesh_a, mesh_b = self.pool.verts[a], self.pool.verts[b]
+            truth = self._body(who_a, how_b) if self.ground_truth else None
             descriptors = {
                 "identity_descriptors": gather_vertices(self.pool.descriptors[a], order_a),
                 "pose_descriptors": gather_vertices(self.pool.descriptors[b], order_b),
             }
-        rank_a, rank_b = order_a.argsort(1), order_b.argsort(1)
+        if noise is not None:
+            mesh_b = mesh_b + self.pose_noise * noise.to(mesh_b.dtype)
+        places = torch.arange(orders.shape[2], device=orders.device).expand_as(orders)
+        rank_a, rank_b = torch.empty_like(orders).scatter_(2, orders, places)  # where each vertex went
+        corners = self.model.faces.flatten().expand(len(order_a), -1)
         return PairBatch(
             identity=center(gather_vertices(mesh_a, order_a)),
-            identity_faces=rank_a[:, self.model.faces],
+            identity_faces=rank_a.gather(1, corners).unflatten(1, (-1, 3)),
             pose=center(gather_vertices(mesh_b, order_b)),
-            pose_faces=rank_b[:, self.model.faces],
-            ground_truth=center(gather_vertices(truth, order_a)),
+            pose_faces=rank_b.gather(1, corners).unflatten(1, (-1, 3)),
+            ground_truth=mesh_a[:, :0] if truth is None else center(gather_vertices(truth, order_a)),
             correspondence=rank_b.gather(1, order_a),
             identity_index=who_a,
             pose_index=how_b,
             **descriptors,
         )
 
-
-class PairSampler(Sampler[list[tuple[int, int]]]):
-    """Batches of ``(epoch, i)`` addresses by training step: step ``s`` has the same batch whenever it is reached.
-
-    Every epoch visits each pair once, in an order drawn from the seed and the epoch; a last incomplete batch is
-    dropped. Starting at step ``s`` is how a run resumes.
-
-    Args:
-        length: pairs per epoch.
-        batch_size: pairs per step.
-        start: first step.
-        stop: step to stop before.
-        seed: of the orders.
-        rank: of this process; processes take disjoint parts of each epoch.
-        world_size: number of processes.
-
-    Raises:
-        ValueError: an epoch holds less than one batch per process, or the sizes make no sense.
-    """
-
-    def __init__(
-        self,
-        length: int,
-        batch_size: int,
-        *,
-        start: int = 0,
-        stop: int,
-        seed: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
-    ) -> None:
-        if batch_size < 1 or not 0 <= rank < world_size:
-            raise ValueError(f"need a batch and 0 <= rank < world_size, got {batch_size}, {rank} and {world_size}")
-        self.steps_per_epoch = length // (batch_size * world_size)
-        if self.steps_per_epoch < 1:
-            raise ValueError(
-                f"an epoch of {length} pairs is less than one batch of {batch_size} for each of {world_size} processes"
-            )
-        self.length, self.batch_size, self.start, self.stop = length, batch_size, start, stop
-        self.seed, self.rank, self.world_size = seed, rank, world_size
-
-    def __len__(self) -> int:
-        return max(0, self.stop - self.start)
-
-    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        current, order = -1, torch.empty(0)
-        for step in range(self.start, self.stop):
-            epoch, place = divmod(step, self.steps_per_epoch)
-            if epoch != current:
-                current, order = epoch, torch.randperm(self.length, generator=_generator(self.seed + 2, epoch, 0))
-            begin = (place * self.world_size + self.rank) * self.batch_size
-            yield [(epoch, int(i)) for i in order[begin : begin + self.batch_size]]
-
-
-def pair_loader(dataset: PosePairs, sampler: PairSampler, *, workers: int = 0) -> DataLoader[PairBatch]:
-    """A loader that yields one :class:`PairBatch` per step; the same batches for any number of workers."""
-    return DataLoader(dataset, batch_size=None, sampler=sampler, num_workers=workers, persistent_workers=workers > 0)
-
-
-def _generator(seed: int, epoch: int, i: int) -> torch.Generator:
-    """An independent stream for each address."""
-    mixed = (seed * 0x9E3779B97F4A7C15 + epoch * 0xBF58476D1CE4E5B9 + i * 0x94D049BB133111EB) % (1 << 63)
-    mixed ^= mixed >> 31
-    return torch.Generator().manual_seed(mixed % (1 << 63))
+    def _body(self, identity: Tensor, pose: Tensor) -> Tensor:
+        assert self.model.identities is not None and self.model.poses is not None
+        return self.model(self.model.identities[identity], self.model.poses[pose])

@@ -41,6 +41,10 @@ class MeshPool:
     def __len__(self) -> int:
         return len(self.identity)
 
+    def to(self, device: torch.device | str) -> MeshPool:
+        """The pool on another device."""
+        return MeshPool(**{name: value.to(device) for name, value in self.state_dict().items()})
+
     @classmethod
     def build(
         cls,

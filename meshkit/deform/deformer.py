@@ -4,8 +4,10 @@ import torch
 from torch import Tensor, nn
 
 from meshkit._compile import uncompiled
-from meshkit.deform.arap import ARAPInfo, Options, check_options, deform
+from meshkit.deform.batched_deform import BatchedProblem
+from meshkit.deform.options import ARAPInfo, Options, check_options
 from meshkit.deform.problem import Problem
+from meshkit.deform.single import deform_each
 from meshkit.deform.topology import check_energy
 
 __all__ = ["ARAPDeformer"]
@@ -61,7 +63,7 @@ class ARAPDeformer(nn.Module):
         tol: float | None = None,
         grad: str = "implicit",
         grad_tol: float = 1e-3,
-        solver: str = "splu",
+        solver: str = "auto",
         compiled: bool = False,
         degenerate: str = "raise",
         generator: torch.Generator | None = None,
@@ -120,6 +122,10 @@ class ARAPDeformer(nn.Module):
         handles: Tensor | None,
         generator: torch.Generator | None,
     ) -> tuple[Tensor, ARAPInfo]:
+        if self.options.batched(rest.device):
+            result = self._deform_batch(rest, target, faces, mask, handles, generator or self.generator)
+            if result is not None:
+                return result
         problem = Problem(rest, faces, mask, self.energy, self.degenerate)
         goals = problem.split(target, "target")
         if handles is None:
@@ -128,7 +134,31 @@ class ARAPDeformer(nn.Module):
             own, _ = problem.handles(handles, needed=True)
         none = [None] * problem.batch
         targets = [goal[index] for goal, index in zip(goals, own, strict=True)]
-        return deform(problem, own, targets, none, none, none, self.options)
+        return deform_each(problem, own, targets, none, none, none, self.options)
+
+    def _deform_batch(
+        self,
+        rest: Tensor,
+        target: Tensor,
+        faces: Tensor,
+        mask: Tensor | None,
+        handles: Tensor | None,
+        generator: torch.Generator | None,
+    ) -> tuple[Tensor, ARAPInfo] | None:
+        """Deform all meshes at once where they are, or return None for input that is not fit for it."""
+        if target.shape != rest.shape or not BatchedProblem.possible(rest, faces, mask):
+            return None
+        problem = BatchedProblem(rest, faces, mask, self.energy, self.degenerate)
+        goal = problem.positions(target)
+        if handles is None:
+            fixed = problem.random_handles(self.fraction, generator)
+        else:
+            chosen = problem.handles(handles)
+            if chosen is None:
+                return None
+            fixed, _ = chosen
+        goal = torch.where(fixed[..., None], goal, 0.0)
+        return problem.deform(fixed, goal, self.options, held=handles is None)
 
     def extra_repr(self) -> str:
         """Options in the printed form of the module."""

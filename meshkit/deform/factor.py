@@ -10,7 +10,7 @@ from meshkit.deform.rest import ARAPRest
 
 __all__ = ["SOLVERS", "ARAPFactor"]
 
-SOLVERS = ("splu", "qdldl", "cholespy", "pcg")
+SOLVERS = ("auto", "splu", "qdldl", "cholespy", "pcg", "dense")
 
 
 class ARAPFactor:
@@ -22,7 +22,8 @@ class ARAPFactor:
             every component.
         soft_weights: (V,) weights, at least 0, of the soft targets; 0 where there is none.
         solver: "splu" (scipy), "qdldl" or "cholespy" (if installed), or "pcg": conjugate gradients with the diagonal
-            as preconditioner, which keeps no factor and so suits meshes too large for one.
+            as preconditioner, which keeps no factor and so suits meshes too large for one. "auto" and "dense", which
+            concern whole batches, are "splu" here.
 
     Attributes:
         free: (V - H,) indices of the other vertices.
@@ -42,12 +43,12 @@ class ARAPFactor:
     """
 
     def __init__(
-        self, rest: ARAPRest, handles: Tensor, *, soft_weights: Tensor | None = None, solver: str = "splu"
+        self, rest: ARAPRest, handles: Tensor, *, soft_weights: Tensor | None = None, solver: str = "auto"
     ) -> None:
         import numpy as np
         from scipy import sparse
 
-        check_solver(solver)
+        check_choice("solver", solver, SOLVERS)
         size = rest.topology.num_verts
         self.rest, self.handles = rest, handles.detach().cpu().long()
         _check_handles(self.handles, size)
@@ -71,10 +72,10 @@ class ARAPFactor:
         return self.stiffness[self._free][:, self.handles.numpy()]
 
 
-def check_solver(solver: str) -> None:
-    """Raise ValueError unless the solver is known."""
-    if solver not in SOLVERS:
-        raise ValueError(f"solver must be one of {', '.join(SOLVERS)}; got {solver!r}")
+def check_choice(name: str, value: str, known: tuple[str, ...]) -> None:
+    """Raise ValueError unless the value is a known one."""
+    if value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(known)}; got {value!r}")
 
 
 def _check_handles(handles: Tensor, size: int) -> None:
@@ -211,4 +212,4 @@ def _optional(package: str) -> Any:
         ) from error
 
 
-_MAKERS = {"splu": _splu, "qdldl": _qdldl, "cholespy": _cholespy, "pcg": _pcg}
+_MAKERS = {"auto": _splu, "dense": _splu, "splu": _splu, "qdldl": _qdldl, "cholespy": _cholespy, "pcg": _pcg}

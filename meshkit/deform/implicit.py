@@ -11,7 +11,12 @@ from meshkit.deform.objective import Objective, dot
 from meshkit.deform.rest import stationarity_gradient
 from meshkit.deform.rotation import ClosestRotation, RotationDifferential
 
-__all__ = ["ImplicitMinimum"]
+__all__ = ["SADDLE", "ImplicitMinimum"]
+
+SADDLE = (
+    "negative curvature: the deformation is a saddle and not a minimum, so its gradient is truncated; "
+    "raise max_iter, lower tol, or start elsewhere"
+)
 
 
 class ImplicitMinimum(torch.autograd.Function):
@@ -52,11 +57,7 @@ class ImplicitMinimum(torch.autograd.Function):
         adjoint, negative = hessian.solve(grad, ctx.tol)
         if negative:
             ctx.negative_curvature.fill_(True)
-            warnings.warn(
-                "negative curvature: the deformation is a saddle and not a minimum, so its gradient is truncated; "
-                "raise max_iter, lower tol, or start elsewhere",
-                stacklevel=2,
-            )
+            warnings.warn(SADDLE, stacklevel=2)
         change = hessian.rotation_change(adjoint)
         wanted = ctx.needs_input_grad
         grads: list[Tensor | None] = [None] * 8

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from meshkit.deform.factor import ARAPFactor
-from meshkit.deform.rotation import RotationTracker
+from meshkit.deform.tracker import RotationTracker
 
 __all__ = ["Objective", "Outcome", "minimise"]
 

@@ -1,6 +1,8 @@
 """What the as-rigid-as-possible energies need to know of the connectivity of one mesh."""
 
 from collections import OrderedDict
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import torch
@@ -55,14 +57,11 @@ class ARAPTopology:
         cells = np.arange(count)[:, None] if per_face else f
         self.cells = torch.from_numpy(cells)
         self.num_cells = count if per_face else num_verts
-        self.multiplicity = {"elements": 1, "spokes_and_rims": 3}.get(energy, 2)
-
-        # Edge k of a face, opposite corner k, runs from corner k + 2 to corner k + 1.
-        sign = np.roll(np.eye(3), 1, 0) - np.roll(np.eye(3), 2, 0)
-        held = 1 - np.eye(3) if energy.startswith("spokes") and energy != "spokes_and_rims" else np.ones((3, 3))
-        self.membership = held[: cells.shape[1]]
-        self.stiffness = (sign[:, None] * sign[None]).reshape(9, 3)
-        self.moment = (self.membership[:, None] * sign[None]).reshape(-1, 3)
+        templates = local_templates(energy, torch.device("cpu"))
+        self.multiplicity = templates.multiplicity
+        self.membership, self.stiffness, self.moment = (
+            value.numpy() for value in (templates.membership, templates.stiffness, templates.moment)
+        )
         self.square = Pattern(np.repeat(f.T, 3, 0).ravel(), np.tile(f.T, (3, 1)).ravel(), (num_verts, num_verts))
         self.tall = (
             Pattern(np.repeat(cells.T, 3, 0).ravel(), f.T.ravel(), (self.num_cells, num_verts))
@@ -105,6 +104,37 @@ class ARAPTopology:
         if not self.membership.all():
             total = total - torch.stack(around, 2)
         return total / self.multiplicity
+
+
+@dataclass(frozen=True)
+class Templates:
+    """What one face adds to the matrices of an energy.
+
+    Attributes:
+        multiplicity: m, the number of cells that hold an edge.
+        membership: (C, 3), 1 where the cell at corner c (or of the face, C = 1) holds edge k.
+        stiffness: (9, 3), from half cotangents of the edges to the entry of corners (a, b), a first.
+        moment: (3C, 3), from weighted edge vectors to the entry of cell and corner (c, b), c first.
+    """
+
+    multiplicity: int
+    membership: Tensor
+    stiffness: Tensor
+    moment: Tensor
+
+
+@cache
+def local_templates(energy: str, device: torch.device) -> Templates:
+    """Templates of an energy, as float64 tensors."""
+    # Edge k of a face, opposite corner k, runs from corner k + 2 to corner k + 1.
+    eye = torch.eye(3, dtype=torch.float64, device="cpu")
+    sign = eye.roll(1, 0) - eye.roll(2, 0)
+    held = 1 - eye if energy in ("spokes", "spokes_unclamped") else torch.ones_like(eye)
+    membership = held[:1] if energy == "elements" else held
+    stiffness = (sign[:, None] * sign[None]).reshape(9, 3)
+    moment = (membership[:, None] * sign[None]).reshape(-1, 3)
+    multiplicity = {"elements": 1, "spokes_and_rims": 3}.get(energy, 2)
+    return Templates(multiplicity, membership.to(device), stiffness.to(device), moment.to(device))
 
 
 def check_energy(energy: str) -> None:
