@@ -1,6 +1,9 @@
 """Mesh files: round trips in every format, row order, and what is said about files that are not meshes."""
 
+import json
 import os
+import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from meshkit.io import MeshFileError, atomic_write, load_mesh, save_mesh
+from meshkit.io import MeshFileError, MeshFileWarning, _readers, atomic_write, load_mesh, save_mesh
 
 FORMATS_WITH_VERTICES = ["obj", "off", "ply", "glb"]
 
@@ -67,7 +70,8 @@ def test_obj_keeps_its_rows_whatever_else_is_in_it(tmp_path: Path) -> None:
         "f 3/1/1 4/2/1 1/1/2 2/2/2\n"
         "o second\nv 0 0 1\nusemtl blue\nf 1//1 2//2 -1\nusemtl red\nf 1 2 3 \\\n4 6\n"
     )
-    verts, faces = load_mesh(tmp_path / "m.OBJ")
+    with pytest.warns(MeshFileWarning, match=r"m\.OBJ: faces with more than three corners .* 6 faces in all"):
+        verts, faces = load_mesh(tmp_path / "m.OBJ")
     assert verts.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [9, 9, 9], [0, 0, 1]]
     assert faces.tolist() == [[2, 3, 0], [2, 0, 1], [0, 1, 5], [0, 1, 2], [0, 2, 3], [0, 3, 5]]
 
@@ -76,7 +80,8 @@ def test_off_variants(tmp_path: Path) -> None:
     body = "4 2 0\n# corners\n0 0 0\n1 0 0\n\n1 1 0\n0 1 0\n4 0 1 2 3\n3 0 2 3 255 0 0\n"
     for header in ("OFF\n", "OFF ", "COFF\n"):
         (tmp_path / "m.off").write_text(header + body)
-        verts, faces = load_mesh(tmp_path / "m.off")
+        with pytest.warns(MeshFileWarning, match="split into triangles, 3 faces in all"):
+            verts, faces = load_mesh(tmp_path / "m.off")
         assert verts.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
         assert faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 2, 3]]
 
@@ -150,6 +155,25 @@ def test_truncated_binary_files(tmp_path: Path, sphere: tuple[Tensor, Tensor], e
             load_mesh(file)
 
 
+@pytest.mark.parametrize("extension", ["obj", "off", "ply", "stl"])
+def test_truncated_text_files(tmp_path: Path, sphere: tuple[Tensor, Tensor], extension: str) -> None:
+    """Cut at a line end as well, where what is left looks whole (an OBJ file has no end that could be missing)."""
+    verts, faces = sphere
+    mesh = trimesh.Trimesh(verts.numpy(), faces.numpy(), process=False)
+    options = {"ply": {"encoding": "ascii"}, "stl": {"file_type": "stl_ascii"}}.get(extension, {})
+    text = mesh.export(**{"file_type": extension, **options})
+    lines = (text.decode() if isinstance(text, bytes) else text).splitlines(keepends=True)
+    file = tmp_path / f"m.{extension}"
+    file.write_text("".join(lines))
+    assert len(load_mesh(file)[1]) == len(faces)
+    for cut in (len(lines) // 4, len(lines) // 2, len(lines) - 2):
+        file.write_text("".join(lines[:cut]))
+        if extension == "obj" and cut > len(verts):
+            continue
+        with pytest.raises(MeshFileError, match=r"truncated|ends too early|no faces|not a readable"):
+            load_mesh(file)
+
+
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(MeshFileError, match=r"nowhere\.obj: no such file"):
         load_mesh(tmp_path / "nowhere.obj")
@@ -190,3 +214,132 @@ def test_atomic_write_replaces_whole_files_only(tmp_path: Path) -> None:
         assert target.read_text() == "old"
     assert target.read_text() == "new"
     assert os.listdir(tmp_path) == ["state.json"]
+
+
+@pytest.mark.parametrize("batch", [60, 2**25])
+def test_obj_reads_the_same_in_any_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: int) -> None:
+    """Plain batches are parsed at once, others line by line: both give what trimesh reads."""
+    monkeypatch.setattr(_readers, "_BATCH_BYTES", batch)
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(40, 3)).round(4)
+    faces = rng.integers(1, 41, (70, 3))
+    plain = "".join(f"v {x} {y} {z}\n" for x, y, z in points) + "".join(f"f {a} {b} {c}\n" for a, b, c in faces)
+    slashes = "".join(f"vt {i} 0\nv\t{x} {y} {z} .5 .5 .5\n" for i, (x, y, z) in enumerate(points))
+    slashes += "".join(f"f {a}/{a}/1 {b}//2 {c}/3 # face\n" for a, b, c in faces)
+    relative = "".join(f"  v {x} {y} {z}\r\n" for x, y, z in points) + "".join(
+        f"f {a - 41} \\\n {b} {c}\r\n" for a, b, c in faces
+    )
+    for text in (plain, slashes, relative, plain.replace("\n", "\n\n# comment\n")):
+        (tmp_path / "m.obj").write_text(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # triangles only: nothing to be said
+            verts, triangles = load_mesh(tmp_path / "m.obj")
+        np.testing.assert_array_equal(verts.numpy(), points.astype(np.float32))
+        np.testing.assert_array_equal(triangles.numpy(), faces - 1)
+
+
+def test_off_rows_in_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_readers, "_BATCH_LINES", 2)
+    (tmp_path / "m.off").write_text(
+        "OFF\n5 3 0\n" + "0 0 0\n1 0 0\n1 1 0\n0 1 0\n2 2 2\n" + "3 0 1 2\n5 0 1 2 3 4 9 9\n3 2 1 4\n"
+    )
+    with pytest.warns(MeshFileWarning):
+        verts, faces = load_mesh(tmp_path / "m.off")
+    assert len(verts) == 5
+    assert faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3], [0, 3, 4], [2, 1, 4]]
+
+
+@pytest.mark.parametrize("extension", ["obj", "off", "ply"])
+def test_polygons_become_fans_and_it_is_said(tmp_path: Path, extension: str) -> None:
+    points = ["0 0 0", "1 0 0", "1 1 0", "0 1 0", "0 2 1"]
+    text = {
+        "obj": "".join(f"v {p}\n" for p in points) + "f 1 2 3 4\nf 4 3 5\n",
+        "off": "OFF\n5 2 0\n" + "\n".join(points) + "\n4 0 1 2 3\n3 3 2 4\n",
+        "ply": "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        + "\n".join(points)
+        + "\n4 0 1 2 3\n3 3 2 4\n",
+    }
+    (tmp_path / f"m.{extension}").write_text(text[extension])
+    with pytest.warns(MeshFileWarning, match="more than three corners were split into triangles, 3 faces in all"):
+        verts, faces = load_mesh(tmp_path / f"m.{extension}")
+    assert len(verts) == 5
+    assert sorted(map(sorted, faces.tolist())) == [[0, 1, 2], [0, 2, 3], [2, 3, 4]]
+
+
+def test_files_beyond_the_limit_are_refused(tmp_path: Path, sphere: tuple[Tensor, Tensor]) -> None:
+    file = tmp_path / "m.obj"
+    save_mesh(file, *sphere)
+    size = file.stat().st_size
+    with pytest.raises(MeshFileError, match=rf"m\.obj: {size:,} bytes, more than max_bytes=100"):
+        load_mesh(file, max_bytes=100)
+    assert len(load_mesh(file, max_bytes=size)[0]) == len(sphere[0])
+
+
+def test_small_files_that_claim_to_be_large(tmp_path: Path) -> None:
+    """Counts in a header reserve no memory, and a scene cannot place one mesh without end."""
+    header = (
+        "element vertex 99999999999\nproperty float x\nproperty float y\nproperty float z\nelement face 99999999999\n"
+    )
+    for kind in ("ascii", "binary_little_endian"):
+        text = f"ply\nformat {kind} 1.0\n{header}property list uchar int vertex_indices\nend_header\n0 0 0\n"
+        (tmp_path / "m.ply").write_text(text)
+        with pytest.raises(MeshFileError, match="not a readable PLY mesh"):
+            load_mesh(tmp_path / "m.ply")
+    (tmp_path / "m.off").write_text("OFF\n99999999999 99999999999 0\n0 0 0\n")
+    with pytest.raises(MeshFileError, match="ends too early: 1 of 99999999999 rows"):
+        load_mesh(tmp_path / "m.off")
+    (tmp_path / "m.stl").write_bytes(b" " * 80 + struct.pack("<I", 2**32 - 1) + b"\0" * 50)
+    with pytest.raises(MeshFileError, match="not a readable STL mesh"):
+        load_mesh(tmp_path / "m.stl")
+
+    scene = trimesh.Scene()
+    ball = trimesh.creation.icosphere(3)
+    for number in range(80):
+        scene.add_geometry(ball, geom_name="ball", node_name=f"node{number}")
+    scene.export(tmp_path / "many.glb")
+    with pytest.raises(MeshFileError, match=r"its 80 meshes would take .* MiB, more than max_bytes"):
+        load_mesh(tmp_path / "many.glb", max_bytes=2**20)
+    assert len(load_mesh(tmp_path / "many.glb")[0]) == 80 * len(ball.vertices)
+
+
+def glb(tree: dict, data: bytes = b"") -> bytes:
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(data), len(text), b"JSON") + text + data
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"glTX" + b"\0" * 40, "does not start with glTF"),
+        (glb({"asset": {"version": "2.0"}})[:-1], "damaged or truncated: .* bytes, its header says"),
+        (
+            glb({"accessors": [{"componentType": 5126, "count": 10**9, "type": "VEC3"}]}),
+            "an array of 1000000000 elements cannot be in a file",
+        ),
+        (glb({"extensionsRequired": ["KHR_draco_mesh_compression"]}), "compressed with Draco"),
+        (glb({"asset": {"version": "2.0"}, "scenes": [{"nodes": []}], "nodes": []}), "not a readable GLB"),
+    ],
+)
+def test_bad_glb_files_are_named(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "m.glb").write_bytes(content)
+    with pytest.raises(MeshFileError, match=message):
+        load_mesh(tmp_path / "m.glb")
+
+
+@pytest.mark.parametrize("extension", ["ply", "glb", "off", "stl"])
+def test_bad_numbers_in_every_format(tmp_path: Path, extension: str) -> None:
+    """NaN and faces out of range, written by trimesh, which does not mind."""
+    points = np.eye(4, 3)
+    points[1, 1] = np.nan
+    trimesh.Trimesh(points, [[0, 1, 2]], process=False).export(tmp_path / f"nan.{extension}")
+    with pytest.raises(MeshFileError, match=r"vertices have NaN or infinite|not a readable"):
+        load_mesh(tmp_path / f"nan.{extension}")
+    if extension in ("ply", "off"):
+        kind = {"encoding": "ascii"} if extension == "ply" else {}
+        trimesh.Trimesh(np.eye(4, 3), [[0, 1, 2]], process=False).export(tmp_path / f"far.{extension}", **kind)
+        text = (tmp_path / f"far.{extension}").read_text()
+        (tmp_path / f"far.{extension}").write_text(text.replace("3 0 1 2", "3 0 1 7"))
+        with pytest.raises(MeshFileError, match=r"1 faces refer to vertices outside 0\.\.3|not a readable"):
+            load_mesh(tmp_path / f"far.{extension}")

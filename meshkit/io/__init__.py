@@ -3,13 +3,14 @@
 from meshkit.io.atomic import atomic_write
 from meshkit.io.binding import SurfaceBinding
 from meshkit.io.clean import CleanMesh, clean_mesh
-from meshkit.io.files import MeshFileError, load_mesh, save_mesh
+from meshkit.io.files import MeshFileError, MeshFileWarning, load_mesh, save_mesh
 from meshkit.io.report import MeshReport, mesh_report
 from meshkit.io.simplify import SimpleMesh, simplify
 
 __all__ = [
     "CleanMesh",
     "MeshFileError",
+    "MeshFileWarning",
     "MeshReport",
     "SimpleMesh",
     "SurfaceBinding",

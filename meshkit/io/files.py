@@ -6,47 +6,57 @@ and repeat vertices along texture seams. PLY, STL and GLB go through trimesh.
 """
 
 import os
-from itertools import pairwise
+import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from meshkit.io._readers import read_binary, read_obj, read_off
 from meshkit.io.atomic import atomic_write
 
-__all__ = ["MeshFileError", "load_mesh", "save_mesh"]
+__all__ = ["MeshFileError", "MeshFileWarning", "load_mesh", "save_mesh"]
 
 _EXTENSIONS = (".glb", ".obj", ".off", ".ply", ".stl")
+_ROWS = 2**16  # rows formatted at a time
 
 
 class MeshFileError(ValueError):
     """A file that is not a usable mesh; the message names the file and says what is wrong with it."""
 
 
-def load_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
+class MeshFileWarning(UserWarning):
+    """A file was read, but not as it stands: its polygons became triangles."""
+
+
+def load_mesh(path: str | os.PathLike[str], *, max_bytes: int = 2**28) -> tuple[Tensor, Tensor]:
     """Read a triangle mesh from an OBJ, PLY, OFF, STL or GLB file.
 
-    Vertices keep the order and number of the file, unreferenced and repeated ones included. Polygons become triangles.
+    Vertices keep the order and number of the file, unreferenced and repeated ones included. Polygons become triangles,
+    with a :class:`MeshFileWarning`: fans from their first corner, so that equal faces give equal triangles in every
+    pose (a polygon that is not convex may overlap itself).
     A file with several meshes (OBJ objects, GLB nodes) is read as one: the meshes are concatenated, each in its place.
     An STL file has no vertices, only loose triangles: corners with equal coordinates become one vertex, in order of
     appearance. Normals, texture coordinates, colours and materials are ignored.
 
     Args:
         path: the file; its extension names the format.
+        max_bytes: larger files are refused, 256 MiB by default. An OBJ or OFF file takes about 5 times its size of
+            memory while it is read, the other formats up to 20 times.
 
     Returns:
         Vertices (V, 3) float32, in the file's unit, and faces (F, 3) int64.
 
     Raises:
-        MeshFileError: the file does not exist, has another extension, is damaged, has no faces, fewer than 3 vertices,
-            a coordinate that is not finite, or a face that refers to a vertex that is not there.
+        MeshFileError: the file does not exist, has another extension, is larger than ``max_bytes``, is damaged, has no
+            faces, fewer than 3 vertices, a coordinate that is not finite, or a face that refers to a vertex that is not
+            there.
 
     Example:
         >>> import tempfile
         >>> file = Path(tempfile.mkdtemp()) / "square.obj"
-        >>> _ = file.write_text("v 0 0 0\\nv 1 0 0\\nv 1 1 0\\nv 0 1 0\\nf 1 2 3 4\\n")
+        >>> _ = file.write_text("v 0 0 0\\nv 1 0 0\\nv 1 1 0\\nv 0 1 0\\nf 1 2 3\\nf 1 3 4\\n")
         >>> verts, faces = load_mesh(file)
         >>> verts.shape, faces.tolist()
         (torch.Size([4, 3]), [[0, 1, 2], [0, 2, 3]])
@@ -55,9 +65,11 @@ def load_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
     extension = _extension(path, "read")
     if not path.is_file():
         raise MeshFileError(f"{path}: {'a folder, not a mesh file' if path.is_dir() else 'no such file'}")
-    reader = {".obj": _read_obj, ".off": _read_off}.get(extension, _read_binary)
+    if (size := path.stat().st_size) > max_bytes:
+        raise MeshFileError(f"{path}: {size:,} bytes, more than max_bytes={max_bytes:,}; raise it to read this file")
+    reader = {".obj": read_obj, ".off": read_off}.get(extension, read_binary)
     try:
-        verts, faces = reader(path)
+        verts, faces, polygons = reader(path, max_bytes)
     except Exception as error:
         # trimesh looks for a text decoder when an STL is neither a whole binary file nor plain text.
         reason = "damaged or truncated" if isinstance(error, ImportError) else error
@@ -65,6 +77,9 @@ def load_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
     with np.errstate(over="ignore"):  # what overflows becomes infinite, and is reported as such
         points = verts.astype(np.float32)
     _check(points, faces, path)
+    if polygons:
+        message = f"{path}: faces with more than three corners were split into triangles, {len(faces)} faces in all"
+        warnings.warn(message, MeshFileWarning, stacklevel=2)
     return torch.from_numpy(points), torch.from_numpy(faces)
 
 
@@ -136,90 +151,13 @@ def _check(verts: np.ndarray, faces: np.ndarray, name: Path) -> None:
         )
 
 
-def _fan(polygon: list[int]) -> list[tuple[int, int, int]]:
-    """Triangles from the first corner to every edge that does not touch it."""
-    return [(polygon[0], second, third) for second, third in pairwise(polygon[1:])]
-
-
-def _arrays(verts: list[Any], faces: list[tuple[int, int, int]]) -> tuple[np.ndarray, np.ndarray]:
-    return np.array(verts, dtype=np.float64).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(-1, 3)
-
-
-def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    verts: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-    for number, line in enumerate(text.splitlines(), start=1):
-        kind, *fields = line.split("#")[0].split() or [""]
-        try:
-            if kind == "v":
-                x, y, z, *_ = map(float, fields)  # a weight or a colour may follow
-                verts.append([x, y, z])
-            elif kind == "f":
-                corners = [int(field.split("/")[0]) for field in fields]
-                if len(corners) < 3 or 0 in corners:
-                    raise ValueError("a face lists three or more vertices, counted from 1")
-                # Negative indices count back from the vertices read so far.
-                faces += _fan([i - 1 if i > 0 else len(verts) + i for i in corners])
-        except ValueError as error:
-            raise ValueError(f"line {number}: {error}") from error
-    if not verts and not faces:
-        raise ValueError("no vertices and no faces in it")
-    return _arrays(verts, faces)
-
-
-def _read_off(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    text = path.read_text(encoding="utf-8", errors="replace")
-    lines = iter(fields for line in text.splitlines() if (fields := line.split("#")[0].split()))
-    try:
-        keyword, *counts = next(lines)
-        if keyword not in {"OFF", "COFF", "NOFF", "CNOFF"}:
-            raise ValueError(f"the first word is {keyword[:20]!r}, not OFF")
-        vertex_count, face_count, *_ = map(int, counts or next(lines))  # the counts may follow the keyword
-        verts = [[float(x) for x in next(lines)[:3]] for _ in range(vertex_count)]
-        faces: list[tuple[int, int, int]] = []
-        for _ in range(face_count):
-            size, *corners = map(int, next(lines))
-            if not 3 <= size <= len(corners):
-                raise ValueError(f"face {len(faces)} lists {len(corners)} of its {size} vertices")
-            faces += _fan(corners[:size])
-    except StopIteration:
-        raise ValueError("the file ends too early") from None
-    return _arrays(verts, faces)
-
-
-def _read_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh
-
-    # fix_texture would repeat the vertices of a PLY along its texture seams.
-    options: dict[str, Any] = {"fix_texture": False} if path.suffix.lower() == ".ply" else {}
-    scene = trimesh.load_scene(path, process=False, **options)
-    parts = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh | trimesh.PointCloud)]
-    if not parts:
-        raise ValueError("no mesh in it")
-    triangles = [np.asarray(getattr(part, "faces", np.empty((0, 3))), dtype=np.int64) for part in parts]
-    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    verts = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts])
-    faces = np.concatenate([part + offset for part, offset in zip(triangles, offsets, strict=True)])
-    if path.suffix.lower() == ".stl":
-        return _weld(verts, faces)
-    return verts, faces
-
-
-def _weld(verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One vertex per distinct coordinate triple, in order of first appearance."""
-    _, first, inverse = np.unique(verts, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return verts[first[order]], rank[inverse.reshape(-1)][faces]
-
-
 def _write_text(
     path: Path, header: str, points: np.ndarray, point_format: str, triangles: np.ndarray, face_format: str
 ) -> None:
     # Nine significant digits are enough to recover any float32.
     with path.open("w", encoding="ascii") as stream:
         stream.write(header)
-        np.savetxt(stream, points, fmt=point_format)
-        np.savetxt(stream, triangles, fmt=face_format)
+        for rows, row_format in ((points, point_format), (triangles, face_format)):
+            for start in range(0, len(rows), _ROWS):
+                block = rows[start : start + _ROWS]
+                stream.write(f"{row_format}\n" * len(block) % tuple(block.ravel().tolist()))

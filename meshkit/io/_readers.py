@@ -1,0 +1,263 @@
+"""Readers of the mesh formats: vertices as they stand in the file, polygons as triangles.
+
+Text is read in batches, so that what is held beside the result does not grow with the file. A batch is parsed at once
+where its lines are all alike, and line by line where they are not, which also finds the line to blame.
+"""
+
+import json
+import re
+import struct
+from collections.abc import Callable, Iterator
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from meshkit.io._mesh import Indices, Points
+
+_BATCH_BYTES = 2**25
+_BATCH_LINES = 2**18
+_VERTEX = (b"v ", b"v\t")
+_FACE = (b"f ", b"f\t")
+_SLASHES = re.compile(rb"/\S*")
+
+
+class Parsed(NamedTuple):
+    """A mesh as read; ``polygons`` counts the faces of the file with more than three corners."""
+
+    verts: Points
+    faces: Indices
+    polygons: int = 0
+
+
+def fan(polygons: Indices) -> Indices:
+    """Triangles (P * (K - 2), 3) of polygons (P, K): from the first corner to every edge that does not touch it."""
+    corners = polygons.shape[1]
+    steps = np.arange(1, corners - 1)[:, None] + np.array([-1, 0, 1])
+    steps[:, 0] = 0
+    return polygons[:, steps].reshape(-1, 3)
+
+
+class _Growing:
+    """Arrays that grow batch by batch."""
+
+    def __init__(self) -> None:
+        self.verts: list[Points] = [np.empty((0, 3))]
+        self.faces: list[Indices] = [np.empty((0, 3), dtype=np.int64)]
+        self.count = 0
+        self.polygons = 0
+
+    def add_verts(self, verts: Points) -> None:
+        self.verts.append(verts)
+        self.count += len(verts)
+
+    def add_polygons(self, polygons: Indices) -> None:
+        self.faces.append(fan(polygons))
+        self.polygons += len(polygons) * (polygons.shape[1] > 3)
+
+    def add_mixed(self, polygons: list[list[int]]) -> None:
+        """Polygons of different sizes, kept in order."""
+        triangles = [(p[0], second, third) for p in polygons for second, third in pairwise(p[1:])]
+        self.faces.append(np.array(triangles, dtype=np.int64).reshape(-1, 3))
+        self.polygons += sum(len(p) > 3 for p in polygons)
+
+    def parsed(self) -> Parsed:
+        return Parsed(np.concatenate(self.verts), np.concatenate(self.faces), self.polygons)
+
+
+def _table(lines: list[bytes], dtype: type, columns: tuple[int, ...] | None = None) -> np.ndarray:
+    text = (line.decode("ascii") for line in lines)
+    return np.loadtxt(text, dtype=dtype, comments="#", usecols=columns, ndmin=2)
+
+
+def read_obj(path: Path, _limit: int) -> Parsed:
+    """Vertices and faces of an OBJ file; texture, normals, materials and groups are passed over."""
+    mesh, number = _Growing(), 0
+    with path.open("rb") as stream:
+        while batch := stream.readlines(_BATCH_BYTES):
+            while batch[-1].rstrip().endswith(b"\\") and (more := stream.readline()):
+                batch.append(more)
+            try:
+                _obj_batch(batch, mesh)
+            except ValueError:
+                _obj_lines(batch, number, mesh)
+            number += len(batch)
+    if not mesh.count and not any(map(len, mesh.faces)):
+        raise ValueError("no vertices and no faces in it")
+    return mesh.parsed()
+
+
+def _obj_batch(batch: list[bytes], mesh: _Growing) -> None:
+    """All lines at once; leaves ``mesh`` alone and raises where they are not plain."""
+    if any(line[:1].isspace() and line.strip() for line in batch) or any(b"\\" in line for line in batch):
+        raise ValueError("indented or continued lines")
+    vertex = [line[2:] for line in batch if line.startswith(_VERTEX)]
+    face = [line[2:] for line in batch if line.startswith(_FACE)]
+    verts = _table(vertex, float, (0, 1, 2)) if vertex else np.empty((0, 3))
+    polygons = np.empty((0, 3), dtype=np.int64)
+    if face:
+        block = b"".join(face)
+        polygons = _table((_SLASHES.sub(b"", block) if b"/" in block else block).splitlines(), np.int64)
+    if polygons.shape[1] < 3 or (len(polygons) and polygons.min() < 1):
+        raise ValueError("short faces or relative indices")
+    mesh.add_verts(verts)
+    mesh.add_polygons(polygons - 1)
+
+
+def _obj_lines(batch: list[bytes], start: int, mesh: _Growing) -> None:
+    whole = b""
+    verts: list[list[float]] = []
+    polygons: list[list[int]] = []
+    for number, line in enumerate(batch, start + 1):
+        whole += line.rstrip(b"\r\n")
+        if whole.endswith(b"\\"):
+            whole = whole[:-1] + b" "
+            continue
+        kind, *fields = whole.split(b"#")[0].split() or [b""]
+        whole = b""
+        try:
+            if kind == b"v":
+                x, y, z, *_ = map(float, fields)  # a weight or a colour may follow
+                verts.append([x, y, z])
+            elif kind == b"f":
+                corners = [int(field.split(b"/")[0]) for field in fields]
+                if len(corners) < 3 or 0 in corners:
+                    raise ValueError("a face lists three or more vertices, counted from 1")
+                # Negative indices count back from the vertices read so far.
+                polygons.append([i - 1 if i > 0 else mesh.count + len(verts) + i for i in corners])
+        except (ValueError, OverflowError) as error:
+            raise ValueError(f"line {number}: {error}") from error
+    mesh.add_verts(np.array(verts, dtype=float).reshape(-1, 3))
+    mesh.add_mixed(polygons)
+
+
+def read_off(path: Path, _limit: int) -> Parsed:
+    """Vertices and faces of an OFF file, with or without colours and normals."""
+    mesh = _Growing()
+    with path.open("rb") as stream:
+        lines = (content for line in stream if (content := line.split(b"#")[0].strip()))
+        header = next(lines, b"").split()
+        if not header:
+            raise ValueError("the file ends too early")
+        if header[0] not in {b"OFF", b"COFF", b"NOFF", b"CNOFF"}:
+            raise ValueError(f"the first word is {header[0][:20].decode(errors='replace')!r}, not OFF")
+        counts = header[1:] or next(lines, b"").split()  # the counts may follow the keyword
+        if len(counts) < 2:
+            raise ValueError("the file ends too early")
+        vertex_count, face_count, *_ = map(int, counts)
+        _off_rows(lines, vertex_count, lambda rows, _: mesh.add_verts(_table(rows, float, (0, 1, 2))))
+        _off_rows(lines, face_count, lambda rows, first: _off_faces(rows, first, mesh))
+    return mesh.parsed()
+
+
+def _off_rows(lines: Iterator[bytes], count: int, read: Callable[[list[bytes], int], None]) -> None:
+    done = 0
+    while done < count:
+        rows = list(islice(lines, min(count - done, _BATCH_LINES)))
+        if not rows:
+            raise ValueError(f"the file ends too early: {done} of {count} rows are there")
+        read(rows, done)
+        done += len(rows)
+
+
+def _off_faces(rows: list[bytes], first: int, mesh: _Growing) -> None:
+    try:
+        table = _table(rows, np.int64, (0, 1, 2, 3))
+        if (table[:, 0] == 3).all():
+            mesh.add_polygons(table[:, 1:])
+            return
+    except ValueError:
+        pass
+    polygons = []
+    for number, row in enumerate(rows, first):
+        fields = row.split()
+        size, *corners = map(int, fields[: int(fields[0]) + 1])  # a colour may follow
+        if not 3 <= size <= len(corners):
+            raise ValueError(f"face {number} lists {len(corners)} of its {size} vertices")
+        polygons.append(corners)
+    mesh.add_mixed(polygons)
+
+
+def read_binary(path: Path, limit: int) -> Parsed:
+    """PLY, STL and GLB through trimesh."""
+    import trimesh
+
+    extension = path.suffix.lower()
+    if extension in (".glb", ".stl"):
+        (_check_glb if extension == ".glb" else _check_stl)(path)
+    # fix_texture would repeat the vertices of a PLY along its texture seams.
+    options: dict[str, Any] = {"fix_texture": False} if extension == ".ply" else {}
+    scene = trimesh.load_scene(path, process=False, **options)
+    uses = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
+    bytes_needed = 24 * sum(len(part.vertices) + len(getattr(part, "faces", ())) for part in uses)
+    if bytes_needed > max(limit, 2**20):  # a small file can place one mesh many times
+        raise ValueError(f"its {len(uses)} meshes would take {bytes_needed / 2**20:,.0f} MiB, more than max_bytes")
+    parts = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh | trimesh.PointCloud)]
+    if not parts:
+        raise ValueError("no mesh in it")
+    triangles = [np.asarray(getattr(part, "faces", np.empty((0, 3))), dtype=np.int64) for part in parts]
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    verts = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts])
+    faces = np.concatenate([part + offset for part, offset in zip(triangles, offsets, strict=True)])
+    if extension == ".stl":
+        return Parsed(*_weld(verts, faces))
+    return Parsed(verts, faces, _check_ply(path, verts, faces) if extension == ".ply" else 0)
+
+
+def _check_ply(path: Path, verts: Points, faces: Indices) -> int:
+    """Compare what was read with the header, since text that ends early is read as far as it goes.
+
+    Returns the number of faces in the header if there were polygons among them, else 0.
+    """
+    declared = {"vertex": 0, "face": 0}
+    with path.open("rb") as stream:
+        for line in islice(stream, 1000):
+            if line.startswith(b"end_header"):
+                break
+            words = line.split()
+            if words[:1] == [b"element"] and len(words) == 3 and words[1].decode() in declared:
+                declared[words[1].decode()] = int(words[2])
+    if len(verts) != declared["vertex"] or len(faces) < declared["face"]:
+        raise ValueError(
+            f"truncated: the header declares {declared['vertex']} vertices and {declared['face']} faces, "
+            f"{len(verts)} and {len(faces)} are there"
+        )
+    return declared["face"] if len(faces) > declared["face"] else 0
+
+
+def _check_stl(path: Path) -> None:
+    """Text is read as far as it goes; the end must be there."""
+    with path.open("rb") as stream:
+        start = stream.read(1024)
+        stream.seek(max(path.stat().st_size - 1024, 0))
+        end = stream.read()
+    if start.lstrip()[:5].lower() == b"solid" and b"facet" in start and b"endsolid" not in end.lower():
+        raise ValueError("truncated: there is no endsolid")
+
+
+def _check_glb(path: Path) -> None:
+    """Refuse arrays that are longer than the file: one without data reads as so many zeros."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        head = stream.read(20)
+        if len(head) < 20 or head[:4] != b"glTF":
+            raise ValueError("it does not start with glTF")
+        _, _, length, chunk, kind = struct.unpack("<4sIII4s", head)
+        if kind != b"JSON" or length != size or chunk > size:
+            raise ValueError(f"damaged or truncated: {size} bytes, its header says {length}")
+        tree = json.loads(stream.read(chunk))
+    if "KHR_draco_mesh_compression" in tree.get("extensionsRequired", ()):
+        raise ValueError("its meshes are compressed with Draco; export it without compression")
+    counts = [int(accessor.get("count", 0)) for accessor in tree.get("accessors", ())]
+    if max(counts, default=0) > size:
+        raise ValueError(f"an array of {max(counts)} elements cannot be in a file of {size} bytes")
+
+
+def _weld(verts: Points, faces: Indices) -> tuple[Points, Indices]:
+    """One vertex per distinct coordinate triple, in order of first appearance."""
+    _, first, inverse = np.unique(verts, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return verts[first[order]], rank[inverse.reshape(-1)][faces]
