@@ -163,10 +163,15 @@ class PoseTransferGenerator(nn.Module):
         # Signatures have long tails where a mesh has spikes; four deviations hold all that is signal.
         return ((descriptors - self.descriptor_mean) / self.descriptor_std).clamp(-4, 4)
 
-    def _match(
-        self, identity: Tensor, pose: Tensor, identity_mask: Tensor | None, pose_mask: Tensor | None
+    def match(
+        self,
+        identity: Tensor,
+        pose: Tensor,
+        *,
+        identity_mask: Tensor | None = None,
+        pose_mask: Tensor | None = None,
     ) -> TransportPlan | DensePlan:
-        """The plan between two meshes' features."""
+        """The plan between the features ``(B, N, D)`` and ``(B, M, D)`` of two meshes, which :meth:`encode` gives."""
         pair = (self.theta(identity), self.phi(pose))
         options: dict[str, Any] = {"eps": self.eps, "n_iters": self.n_iters}
         options |= {"mask_x": identity_mask, "mask_y": pose_mask}
@@ -198,7 +203,7 @@ class PoseTransferGenerator(nn.Module):
             identity_features = self.encode(identity, mask=identity_mask, descriptors=identity_descriptors)
         if pose_features is None:
             pose_features = self.encode(pose, mask=pose_mask, descriptors=pose_descriptors)
-        plan = self._match(identity_features, pose_features, identity_mask, pose_mask)
+        plan = self.match(identity_features, pose_features, identity_mask=identity_mask, pose_mask=pose_mask)
         if pose_mask is not None:
             pose = pose.masked_fill(~pose_mask[..., None], 0.0)
         values = pose.to(plan.dtype)

@@ -1,5 +1,14 @@
 """Pose transfer between any two meshes."""
 
 from meshkit.transfer.confidence import Confidence, confidence, usual_range
+from meshkit.transfer.transfer import PoseTransfer, TransferReport, TransferResult, transfer_pose
 
-__all__ = ["Confidence", "confidence", "usual_range"]
+__all__ = [
+    "Confidence",
+    "PoseTransfer",
+    "TransferReport",
+    "TransferResult",
+    "confidence",
+    "transfer_pose",
+    "usual_range",
+]

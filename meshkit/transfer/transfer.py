@@ -1,0 +1,297 @@
+"""Pose transfer between any two meshes."""
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from meshkit.deform import arap_deform
+from meshkit.transfer.choose import Weights, choose_weights
+from meshkit.transfer.confidence import Confidence, confidence
+from meshkit.transfer.frames import turn_up
+from meshkit.transfer.prepare import Mesh, Prepared, named, prepare
+
+__all__ = ["PoseTransfer", "TransferReport", "TransferResult", "transfer_pose"]
+
+_VERTICES = {"humans": 1000, "animals": 1962}
+REFINE = 0.1
+"""Default weight of the network's result in the refinement, against the stiffness of the identity's surface."""
+
+
+@dataclass(frozen=True)
+class TransferReport:
+    """What was done and how far to trust it; ``print`` it to read it.
+
+    Attributes:
+        identity: the identity mesh and what was made of it.
+        pose: the pose mesh likewise.
+        weights: which, and why.
+        confidence: numbers that tell an ordinary transfer from an unusual one.
+        warnings: what is unusual, in words; empty if nothing is.
+        calibrated: whether the weights' card says what is usual; otherwise there are no warnings from the numbers.
+        refined: weight of the network's result in the refinement; ``None`` if there was none.
+        seconds: time taken.
+    """
+
+    identity: Prepared
+    pose: Prepared
+    weights: str
+    confidence: Confidence
+    warnings: tuple[str, ...]
+    calibrated: bool
+    refined: float | None
+    seconds: float
+
+    def __str__(self) -> str:
+        numbers = self.confidence
+        facts = [f"edges change by {numbers.edge_change:.1%}"]
+        if numbers.match_spread is not None and numbers.mutual_share is not None:
+            facts.append(f"matches spread over {numbers.match_spread:.2%} of the pose mesh")
+            facts.append(f"{numbers.mutual_share:.0%} of them mutual")
+        lines = [f"identity {self.identity.name}", _indented(str(self.identity))]
+        lines += [f"pose     {self.pose.name}", _indented(str(self.pose)), f"weights  {self.weights}"]
+        lines.append(f"result   {', '.join(facts)}; {self.seconds:.1f} s")
+        if self.warnings:
+            lines += [f"UNUSUAL  {warning}" for warning in self.warnings]
+        elif self.calibrated:
+            lines.append("         all within what is usual for the weights' own test pairs")
+        else:
+            lines.append("         these weights do not say what is usual")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class TransferResult:
+    """The identity mesh in the pose of the pose mesh.
+
+    Attributes:
+        verts: (V, 3) float32 vertices, in number and order of the identity file.
+        faces: (F, 3) the identity file's faces.
+        report: what was done and how far to trust it.
+        views: vertices and faces of identity, pose and result, upright and to scale, for pictures.
+    """
+
+    verts: Tensor
+    faces: Tensor
+    report: TransferReport
+    views: tuple[tuple[Tensor, Tensor], ...]
+
+
+class PoseTransfer:
+    """Pose transfer to one identity: what concerns the identity mesh is done once.
+
+    Args:
+        identity: the mesh that gives the body; file, or vertices (V, 3) and faces (F, 3).
+        weights: ``"auto"`` (people's or animals', by the shape of the identity mesh), a name of
+            :func:`meshkit.models.pretrained_names`, the folder of a training run, or a
+            :class:`meshkit.models.PretrainedTransfer`.
+        refine: ``True``: let the identity mesh deform as rigidly as possible towards the network's result, which keeps
+            its local shape; a positive number: the same, with this weight of the network's result (default 0.1; more
+            follows the network more closely); ``False``: the network's result as it is.
+        frame: the axes, unit and place of the result. ``"pose"``: the pose file's, so that the result stands where the
+            pose mesh stands. ``"identity"``: the identity file's up axis and unit; the body is upright in that file
+            where it is upright in the pose file, and keeps its heading and place as far as the two files' axes agree.
+        identity_up, identity_facing, identity_unit: signed axis to the head, signed axis of the gaze, and unit
+            (m, cm, mm, in, ft) of the identity file; found from the mesh where ``None``.
+        device: where to compute; that of the network, or the CPU, if ``None``.
+
+    Raises:
+        MeshFileError: a file is missing, damaged or no mesh.
+        ValueError: unknown weights or options, or a mesh that cannot be used.
+
+    Example:
+        >>> from meshkit.data import load_humans
+        >>> from meshkit.models import GeneratorConfig, PretrainedTransfer
+        >>> config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16))
+        >>> net = PretrainedTransfer(config.build(), config)  # untrained: in use, leave weights to "auto"
+        >>> body = load_humans()
+        >>> axes = {"identity_up": "+z", "identity_facing": "-y"}
+        >>> transfer = PoseTransfer((body.template, body.faces), weights=net, refine=False, **axes)
+        >>> pose = body(torch.tensor([3]), torch.tensor([10]))[0]
+        >>> transfer((pose, body.faces), pose_up="+z", pose_facing="-y").verts.shape
+        torch.Size([1000, 3])
+    """
+
+    def __init__(
+        self,
+        identity: Mesh,
+        *,
+        weights: Weights = "auto",
+        refine: bool | float = True,
+        frame: Literal["pose", "identity"] = "pose",
+        identity_up: str | None = None,
+        identity_facing: str | None = None,
+        identity_unit: str | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        if frame not in ("pose", "identity"):
+            raise ValueError(f"frame must be 'pose' or 'identity', got {frame!r}")
+        if refine is not True and refine is not False and not refine > 0:
+            raise ValueError(f"refine must be True, False or a positive weight, got {refine!r}")
+        self.frame = frame
+        self.refine = REFINE if refine is True else None if refine is False else float(refine)
+        self.net, self.weights = choose_weights(weights, identity, device=device)
+        self._kind = self.net.card.get("data")
+        self._num_verts = self.net.card.get("vertices") or _VERTICES.get(self._kind or "", 1000)
+        self.identity = self._prepare(identity, "identity", identity_unit, identity_up, identity_facing)
+
+    def _prepare(self, mesh: Mesh, role: Any, unit: str | None, up: str | None, facing: str | None) -> Prepared:
+        options = {"net": self.net, "kind": self._kind, "num_verts": self._num_verts}
+        return prepare(mesh, role, unit=unit, up=up, facing=facing, **options)
+
+    @torch.no_grad()
+    def __call__(
+        self, pose: Mesh, *, pose_up: str | None = None, pose_facing: str | None = None, pose_unit: str | None = None
+    ) -> TransferResult:
+        """Give the identity the pose of a mesh; its axes and unit are found where they are ``None``.
+
+        Raises:
+            MeshFileError: the file is missing, damaged or no mesh.
+            ValueError: an unknown option, or a mesh that cannot be used.
+        """
+        start = time.perf_counter()
+        other = self._prepare(pose, "pose", pose_unit, pose_up, pose_facing)
+        return self.apply(other, start)
+
+    @torch.no_grad()
+    def apply(self, other: Prepared, start: float) -> TransferResult:
+        """The transfer from a prepared pose mesh; ``start`` is when the work on it began."""
+        own, net = self.identity, self.net
+        sides = {"identity_faces": own.simple.faces, "pose_faces": other.simple.faces}
+        output = named(f"{own.name}, {other.name}", lambda: net.output(own.verts, other.verts, **sides))
+        numbers = confidence(net, own.verts, other.verts, **sides, output=output)
+        small = output.vertices
+        if not bool(torch.isfinite(small).all()):
+            raise ValueError(f"{other.name}: the network's result is not finite; the weights cannot do this pair")
+        if self.refine is not None:
+            small = _refined(own.verts, own.simple.faces, small, self.refine)
+        posed = own.carry(small)
+        usual = net.card.get("usual", {})
+        report = TransferReport(
+            own,
+            other,
+            self.weights,
+            numbers,
+            numbers.warnings(usual),
+            bool(usual),
+            self.refine,
+            time.perf_counter() - start,
+        )
+        faces = own.faces
+        views = (
+            (own.clean.verts @ own.rotation.T, own.clean.faces),
+            (other.clean.verts @ other.rotation.T, other.clean.faces),
+            (posed, faces.to(posed.device)),
+        )
+        return TransferResult(self._placed(posed, other).cpu(), faces, report, views)
+
+    def _placed(self, posed: Tensor, other: Prepared) -> Tensor:
+        """From the frame of the weights to that of a file: on the ground, and over the place, of the pose mesh."""
+        own = self.identity
+        metric, rotation = own.scale.fit, other.rotation
+        stand = _standing_point(other.clean.verts @ rotation.T) / other.scale.fit
+        kept = own.clean.target.to(posed.device) >= 0  # loose parts do not decide where the body stands
+        posed = posed / metric
+        posed = posed - _standing_point(posed[kept]) + stand
+        in_pose_axes = posed @ rotation
+        if self.frame == "pose":
+            return in_pose_axes / other.scale.metres
+        turn = turn_up(other.up.cpu(), own.up.cpu()).to(posed)
+        return in_pose_axes @ turn.T / own.scale.metres
+
+
+def _standing_point(verts: Tensor) -> Tensor:
+    """Middle of the bounding box, at its lowest height."""
+    low, high = verts.amin(0), verts.amax(0)
+    middle = (low + high) / 2
+    return torch.stack([middle[0], middle[1], low[2]])
+
+
+def _refined(rest: Tensor, faces: Tensor, target: Tensor, weight: float) -> Tensor:
+    none = torch.empty(0, dtype=torch.long, device=rest.device)
+    weights = torch.full((len(rest),), weight, dtype=rest.dtype, device=rest.device)
+    deformed, _ = arap_deform(
+        rest,
+        faces,
+        none,
+        rest.new_empty(0, 3),
+        soft_targets=target,
+        soft_weights=weights,
+        init=target,
+        max_iter=60,
+        grad="none",
+        degenerate="ignore",
+    )
+    return deformed
+
+
+def _indented(text: str) -> str:
+    return "\n".join(f"  {line}" for line in text.splitlines())
+
+
+def transfer_pose(
+    identity: Mesh,
+    pose: Mesh,
+    *,
+    weights: Weights = "auto",
+    refine: bool | float = True,
+    frame: Literal["pose", "identity"] = "pose",
+    identity_up: str | None = None,
+    identity_facing: str | None = None,
+    identity_unit: str | None = None,
+    pose_up: str | None = None,
+    pose_facing: str | None = None,
+    pose_unit: str | None = None,
+    device: torch.device | str | None = None,
+) -> TransferResult:
+    """Give one mesh the pose of another.
+
+    The two may differ in vertex count, topology, axes and unit, and may be unclean. Both are reported on, cleaned
+    (the largest connected part counts; the rest of the identity mesh follows it), scaled to metres, simplified to the
+    size that the weights were trained at, and turned to their frame; the network's result is refined and carried to
+    all vertices of the identity file. For many poses of one identity use :class:`PoseTransfer` or
+    :func:`transfer_sequence`.
+
+    Args:
+        identity: the mesh that gives the body; file, or vertices (V, 3) and faces (F, 3).
+        pose: the mesh that gives the pose, likewise.
+        weights: see :class:`PoseTransfer`, as all that follows.
+        refine: keep the identity's local shape.
+        frame: axes, unit and place of the result: the ``"pose"`` file's or the ``"identity"`` file's.
+        identity_up: signed axis such as ``"+y"`` to the head; ``None`` to find it.
+        identity_facing: signed axis of the gaze; ``None`` to find it.
+        identity_unit: m, cm, mm, in or ft; ``None`` to guess it.
+        pose_up: likewise for the pose file.
+        pose_facing: likewise.
+        pose_unit: likewise.
+        device: where to compute.
+
+    Returns:
+        The posed mesh, in the vertex order of the identity file, and the report.
+
+    Raises:
+        MeshFileError: a file is missing, damaged or no mesh.
+        ValueError: unknown weights or options, or a mesh that cannot be used.
+
+    Example:
+        >>> from meshkit.data import load_humans
+        >>> from meshkit.models import pretrained_names
+        >>> body = load_humans()
+        >>> identity, pose = body(torch.tensor([3, 50]), torch.tensor([10, 500]))
+        >>> if "xdualnet-humans" in pretrained_names():
+        ...     result = transfer_pose((identity, body.faces), (100 * pose, body.faces), weights="xdualnet-humans")
+        ...     assert result.report.pose.scale.unit == "cm"
+    """
+    transfer = PoseTransfer(
+        identity,
+        weights=weights,
+        refine=refine,
+        frame=frame,
+        identity_up=identity_up,
+        identity_facing=identity_facing,
+        identity_unit=identity_unit,
+        device=device,
+    )
+    return transfer(pose, pose_up=pose_up, pose_facing=pose_facing, pose_unit=pose_unit)
