@@ -142,6 +142,11 @@ def plot_curves(
         FigureCanvasAgg(figure).print_png(temporary)
 
 
+def paste_title(sheet: "Image", text: str, center: tuple[int, int], size: int, room: int) -> None:
+    """Write a bold title around ``center``, smaller when it would be wider than ``room`` pixels."""
+    _paste_text(sheet, text, center, size, room, bold=True)
+
+
 def _check_grid(
     rows: Sequence[Sequence[Picture | None]],
     column_titles: Sequence[str],

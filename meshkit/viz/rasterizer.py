@@ -7,14 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from meshkit.viz._mesh import CLAY, GAMMA, Array, as_array, check_colors, check_mesh, fit_view
+
 __all__ = ["error_colors", "render"]
 
-Array = NDArray[np.float64]
-
-_CLAY = (0.69, 0.77, 0.88)
-_MARGIN = 1.08  # picture side over the extent of the body, when neither scale nor bounds is given
 _CHUNK = 2**19  # candidate pixels expanded at a time; bounds the memory of large pictures
-_GAMMA = 2.2
 
 # Camera space: x right, y up, z towards the viewer. Direction, strength.
 _KEY = ((-0.55, 0.60, 0.58), 0.88)
@@ -72,29 +69,23 @@ def render(
         >>> picture.shape, picture.dtype
         ((48, 64, 3), dtype('uint8'))
     """
-    points, triangles = _array(verts), _array(faces).astype(np.int64)
-    _check_mesh(points, triangles)
-    albedo = np.broadcast_to(_CLAY, points.shape) if colors is None else _array(colors)
-    _check_options(points, albedo, size, up, shading, supersample, scale)
+    points, triangles = as_array(verts), as_array(faces).astype(np.int64)
+    check_mesh(points, triangles)
+    albedo = np.broadcast_to(CLAY, points.shape) if colors is None else as_array(colors)
+    check_colors(points, albedo)
+    if shading not in {"smooth", "flat", "none"}:
+        raise ValueError(f"shading must be 'smooth', 'flat' or 'none', got {shading!r}")
+    if min(size) < 1 or supersample < 1:
+        raise ValueError(f"size and supersample must be at least 1, got {size} and {supersample}")
 
     width, height = size[0] * supersample, size[1] * supersample
-    camera = _camera(azimuth, elevation, up)
-    view = points @ camera.T
-    corners = view if bounds is None else _box_corners(bounds) @ camera.T
-    low, high = corners.min(0), corners.max(0)
-    if scale is None:
-        extent = (high - low)[:2] * min(size) / np.array(size)
-        scale = float(extent.max()) * _MARGIN or 1.0
-    pixels = (view - (low + high) / 2) * (min(width, height) / scale)
-    pixels[:, 0] += width / 2
-    pixels[:, 1] = height / 2 - pixels[:, 1]
-
+    view = fit_view(points, (width, height), azimuth=azimuth, elevation=elevation, up=up, scale=scale, bounds=bounds)
     picture = np.tile(np.asarray(background, dtype=np.float64), (width * height, 1))
-    hit, face, barycentric = _rasterize(pixels, triangles, width, height)
+    hit, face, barycentric = rasterize(view.project(points), triangles, width, height)
     corner = triangles[face]
     color = np.einsum("pk,pkc->pc", barycentric, albedo[corner])
     if shading != "none":
-        face_normals, vertex_normals = _normals(view, triangles)
+        face_normals, vertex_normals = _normals(points @ view.axes.T, triangles)
         smooth = np.einsum("pk,pkc->pc", barycentric, vertex_normals[corner])
         color = _shade(color, smooth if shading == "smooth" else face_normals[face], face_normals[face, 2] < 0)
     picture[hit] = color
@@ -124,7 +115,7 @@ def error_colors(error: Tensor | ArrayLike, vmax: float) -> Array:
     """
     import matplotlib
 
-    values = _array(error)
+    values = as_array(error)
     if values.ndim != 1 or not np.isfinite(values).all():
         raise ValueError(f"error must be (V,) finite numbers, got shape {values.shape}")
     if not vmax > 0:
@@ -133,59 +124,7 @@ def error_colors(error: Tensor | ArrayLike, vmax: float) -> Array:
     return np.asarray(matplotlib.colormaps["magma_r"](level))[:, :3]
 
 
-def _array(values: Tensor | ArrayLike) -> Array:
-    return np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
-
-
-def _check_mesh(points: Array, triangles: NDArray[np.int64]) -> None:
-    if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
-        raise ValueError(f"one mesh is verts (V, 3) and faces (F, 3), got {points.shape} and {triangles.shape}")
-    if len(points) == 0 or len(triangles) == 0:
-        raise ValueError(f"nothing to draw: {len(points)} vertices and {len(triangles)} faces")
-    bad = int((~np.isfinite(points)).any(1).sum())
-    if bad:
-        raise ValueError(f"{bad} of {len(points)} vertices have NaN or infinite coordinates")
-    if triangles.min() < 0 or triangles.max() >= len(points):
-        raise ValueError(
-            f"face indices run from {triangles.min()} to {triangles.max()}, but there are {len(points)} vertices; "
-            "remove the padding first"
-        )
-
-
-def _check_options(
-    points: Array, albedo: Array, size: tuple[int, int], up: str, shading: str, supersample: int, scale: float | None
-) -> None:
-    if albedo.shape != points.shape or not ((albedo >= 0) & (albedo <= 1)).all():
-        raise ValueError(f"colors must be (V, 3) = {points.shape} with values in [0, 1], got shape {albedo.shape}")
-    if up not in {"y", "z"}:
-        raise ValueError(f"up must be 'y' or 'z', got {up!r}")
-    if shading not in {"smooth", "flat", "none"}:
-        raise ValueError(f"shading must be 'smooth', 'flat' or 'none', got {shading!r}")
-    if min(size) < 1 or supersample < 1:
-        raise ValueError(f"size and supersample must be at least 1, got {size} and {supersample}")
-    if scale is not None and not 0 < scale < np.inf:
-        raise ValueError(f"scale must be a length above 0, got {scale}")
-
-
-def _box_corners(bounds: Tensor | ArrayLike) -> Array:
-    box = _array(bounds)
-    if box.shape != (2, 3) or not np.isfinite(box).all() or (box[0] > box[1]).any():
-        raise ValueError(f"bounds must be a finite (2, 3) lowest and highest corner, got {box.tolist()}")
-    return np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
-
-
-def _camera(azimuth: float, elevation: float, up: str) -> Array:
-    """Rotation whose rows are the camera's right, up and backward axes in the coordinates of the mesh."""
-    turn, rise = np.radians(azimuth), np.radians(elevation)
-    right = np.array([np.cos(turn), np.sin(turn), 0.0])
-    backward = np.array([np.sin(turn) * np.cos(rise), -np.cos(turn) * np.cos(rise), np.sin(rise)])
-    axes = np.stack([right, np.cross(backward, right), backward])
-    if up == "y":  # (x, y, z) with y up is (x, -z, y) with z up
-        axes = axes @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    return axes
-
-
-def _rasterize(
+def rasterize(
     points: Array, triangles: NDArray[np.int64], width: int, height: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Covered pixels (P,), the nearest face at each (P,), and the barycentric coordinates there (P, 3).
@@ -247,4 +186,4 @@ def _shade(color: Array, normals: Array, inside: NDArray[np.bool_]) -> Array:
     light = light * np.where(inside, _INSIDE, 1.0)
     halfway = _unit(_unit(np.array(_KEY[0])) + np.array([0.0, 0.0, 1.0]))
     gloss = 0.05 * (normals @ halfway).clip(0) ** 24 * ~inside
-    return np.asarray((color**_GAMMA * light[:, None] + gloss[:, None]).clip(0, 1) ** (1 / _GAMMA))
+    return np.asarray((color**GAMMA * light[:, None] + gloss[:, None]).clip(0, 1) ** (1 / GAMMA))
