@@ -122,8 +122,9 @@ posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces
 
 - **Input**: two meshes in metres, z up, facing -y, around {card["vertices"]} vertices each; `meshkit.transfer` brings
   others there.
-- **Training**: `{card["command"]}` ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor},
-  {card["precision"]}, torch {machine["torch"]}), finished on {card["date"]}.
+- **Training**: `{card["command"]}`
+  ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor}, {card["precision"]}, torch
+  {machine["torch"]}), finished on {card["date"]}.
 - **Split**: {card["split"]}
 - **Size**: {card["parameters"]:,} parameters, stored with 16 bits. Rounding them moves no vertex of
   {card["rounding"]["pairs"]} test pairs by more than {1e3 * card["rounding"]["largest_distance_m"]:.3f} mm.
@@ -132,7 +133,8 @@ posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces
 ## Figures
 
 Means over the first {card["test_pairs"]} fixed test pairs, by the network as it was trained, not rounded.
-Units: {card["units"]}. `copy_identity` and `copy_warped` are what the unchanged identity and the warped mesh would score.
+Units: {card["units"]}. `copy_identity` and `copy_warped` are what the unchanged
+identity and the warped mesh would score.
 
 | figure | value |
 |---|---:|

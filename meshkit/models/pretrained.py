@@ -184,5 +184,5 @@ def load_pretrained(name: str, *, device: torch.device | str = "cpu") -> Pretrai
     config = GeneratorConfig.from_json(json.dumps(card["model"]))
     state = load((folder / f"{name}.safetensors").read_bytes())
     generator = config.build()
-    generator.load_state_dict({key: value.float() if value.is_floating_point() else value for key, value in state.items()})
+    generator.load_state_dict({key: v.float() if v.is_floating_point() else v for key, v in state.items()})
     return PretrainedTransfer(generator, config, card=card).to(device).eval()

@@ -1,6 +1,8 @@
 """Pose transfer between any two meshes."""
 
 from meshkit.transfer.confidence import Confidence, confidence, usual_range
+from meshkit.transfer.output import save_page, save_picture
+from meshkit.transfer.sequence import read_sequence, transfer_sequence
 from meshkit.transfer.transfer import PoseTransfer, TransferReport, TransferResult, transfer_pose
 
 __all__ = [
@@ -9,6 +11,10 @@ __all__ = [
     "TransferReport",
     "TransferResult",
     "confidence",
+    "read_sequence",
+    "save_page",
+    "save_picture",
     "transfer_pose",
+    "transfer_sequence",
     "usual_range",
 ]

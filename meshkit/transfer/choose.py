@@ -30,6 +30,8 @@ def choose_weights(
         ValueError: no such weights, or none to choose from.
         MeshFileError: the identity mesh has to be looked at and cannot be read.
     """
+    if device is not None:
+        _check_device(device)
     if isinstance(weights, PretrainedTransfer):
         return (weights if device is None else weights.to(device)).eval(), weights.card.get("name", "the given network")
     if weights != "auto":
@@ -44,6 +46,13 @@ def choose_weights(
     best = min(fitting, key=lambda net: net.card["figures"]["pmd"])
     doubt = "" if clear else ", though not clearly: name the weights if this is wrong"
     return best.to(device or "cpu"), f"{best.card['name']}, as the identity's shape is that of {kind}{doubt}"
+
+
+def _check_device(device: torch.device | str) -> None:
+    try:
+        torch.empty(0, device=device)
+    except (AssertionError, RuntimeError) as error:  # torch's words for a name it does not know, or has no driver for
+        raise ValueError(f"device {device} cannot be used: {(str(error).splitlines() or [''])[0]}") from error
 
 
 def _load(weights: str | os.PathLike[str], device: torch.device | str) -> PretrainedTransfer:

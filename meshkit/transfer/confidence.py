@@ -12,15 +12,15 @@ from torch import Tensor
 from meshkit.metrics import edge_ratio
 from meshkit.models import GeneratorOutput, PretrainedTransfer
 
-__all__ = ["Confidence", "confidence", "usual_range"]
+__all__ = ["Confidence", "confidence", "row_entropies", "usual_range"]
 
 # Field, whether large values are the unusual ones, and what an unusual value says.
 _MEANINGS = (
-    ("match_spread", True, "the matching is vague: each vertex matches {value:.1%} of the pose mesh, usually {usual:.1%}"),
+    ("match_spread", True, "the matching is vague: a vertex matches {value:.1%} of the pose mesh, usually {usual:.1%}"),
     ("mutual_share", False, "few vertices match both ways: {value:.0%}, usually {usual:.0%}"),
     ("edge_change", True, "edges change their length by {value:.0%} on average, usually {usual:.0%}"),
-    ("identity_distance", True, "the identity mesh is unlike the training meshes: {value:.2f} deviations, usually {usual:.2f}"),
-    ("pose_distance", True, "the pose mesh is unlike the training meshes: {value:.2f} deviations, usually {usual:.2f}"),
+    ("identity_distance", True, "the identity mesh is unlike training meshes: {value:.2f} off, usually {usual:.2f}"),
+    ("pose_distance", True, "the pose mesh is unlike training meshes: {value:.2f} off, usually {usual:.2f}"),
 )  # fmt: skip
 
 
@@ -72,10 +72,9 @@ def confidence(
     result: GeneratorOutput = output
     spread = mutual = None
     if result.plan is not None:
-        log_row = result.plan.log_dense()[0].log_softmax(1)
-        entropy = -(log_row.exp() * log_row.clamp_min(-1e4)).sum(1)
-        spread = float(entropy.exp().mean()) / len(pose)
-        forward, backward = log_row.argmax(1), result.plan.log_dense()[0].argmax(0)
+        mass = result.plan.dense()[0]
+        spread = float(row_entropies(mass).exp().mean()) / len(pose)
+        forward, backward = mass.argmax(1), mass.argmax(0)
         mutual = float((backward[forward] == torch.arange(len(forward), device=forward.device)).float().mean())
     vertices = result.vertices if result.vertices.dim() == 3 else result.vertices[None]
     return Confidence(
@@ -85,6 +84,12 @@ def confidence(
         identity_distance=_distance(net, identity, identity_faces),
         pose_distance=_distance(net, pose, pose_faces),
     )
+
+
+def row_entropies(plan: Tensor) -> Tensor:
+    """Entropy (N,), in nats, of each row of a plan (N, M), taken as a distribution; 0 for a row without mass."""
+    share = plan / plan.sum(1, keepdim=True).clamp_min(torch.finfo(plan.dtype).tiny)
+    return -torch.special.xlogy(share, share).sum(1)
 
 
 def _distance(net: PretrainedTransfer, verts: Tensor, faces: Tensor) -> float | None:

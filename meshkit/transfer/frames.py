@@ -10,8 +10,9 @@ from torch import Tensor
 
 from meshkit.batching import center
 from meshkit.models import PoseTransferGenerator, PretrainedTransfer
+from meshkit.transfer.confidence import row_entropies
 
-__all__ = ["UNITS", "axis_vector", "find_rotation", "find_scale", "rotations", "turn_up"]
+__all__ = ["UNITS", "axis_vector", "find_rotation", "find_scale", "rotations", "turn_up", "turns_about"]
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Metres in each unit."""
@@ -61,6 +62,12 @@ def rotations(up: str | None = None, facing: str | None = None) -> Tensor:
     if not found:
         raise ValueError(f"up and facing must be at right angles, got {up} and {facing}")
     return torch.stack(sorted(found, key=lambda matrix: -float(matrix.trace())))
+
+
+def turns_about(rotation: Tensor) -> Tensor:
+    """A rotation (3, 3) and the six that are a quarter turn away: (7, 3, 3), itself first."""
+    quarters = [torch.eye(3), *(turn for turn in rotations() if abs(float(turn.trace()) - 1) < 0.5)]
+    return torch.stack(quarters).to(rotation) @ rotation
 
 
 def turn_up(source: Tensor, target: Tensor) -> Tensor:
@@ -164,8 +171,7 @@ def find_rotation(
     for rotation in candidates.to(verts):
         turned = center((verts @ rotation.T)[None])
         plan = generator.match(generator.encode(turned, descriptors=descriptors), rest_features)
-        log_row = plan.log_dense()[0].log_softmax(1)
-        entropies.append(float(-(log_row.exp() * log_row.clamp_min(-1e4)).sum(1).mean()))
+        entropies.append(float(row_entropies(plan.dense()[0]).mean()))
     best = min(range(len(entropies)), key=entropies.__getitem__)
     best = 0 if entropies[0] < entropies[best] + _CLEAR else best
     return candidates[best], entropies

@@ -4,7 +4,6 @@ import dataclasses
 import os
 import warnings
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -88,7 +87,7 @@ def read(mesh: Mesh, role: str) -> tuple[str, Tensor, Tensor, tuple[str, ...]]:
 
 def prepare(
     mesh: Mesh,
-    role: Literal["identity", "pose"],
+    role: str,
     *,
     net: PretrainedTransfer,
     kind: str | None,
@@ -143,7 +142,12 @@ def prepare(
 
 
 def _rotation(
-    report: MeshReport, simple: SimpleMesh, net: PretrainedTransfer, kind: str | None, up: str | None, facing: str | None
+    report: MeshReport,
+    simple: SimpleMesh,
+    net: PretrainedTransfer,
+    kind: str | None,
+    up: str | None,
+    facing: str | None,
 ) -> tuple[Tensor, str]:
     if up is not None and facing is not None:
         return rotations(up, facing)[0], "given"

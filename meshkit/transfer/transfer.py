@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -133,13 +133,14 @@ class PoseTransfer:
         self.frame = frame
         self.refine = REFINE if refine is True else None if refine is False else float(refine)
         self.net, self.weights = choose_weights(weights, identity, device=device)
-        self._kind = self.net.card.get("data")
-        self._num_verts = self.net.card.get("vertices") or _VERTICES.get(self._kind or "", 1000)
+        self.kind: str | None = self.net.card.get("data")
+        self._num_verts = self.net.card.get("vertices") or _VERTICES.get(self.kind or "", 1000)
         self.identity = self._prepare(identity, "identity", identity_unit, identity_up, identity_facing)
 
-    def _prepare(self, mesh: Mesh, role: Any, unit: str | None, up: str | None, facing: str | None) -> Prepared:
-        options = {"net": self.net, "kind": self._kind, "num_verts": self._num_verts}
-        return prepare(mesh, role, unit=unit, up=up, facing=facing, **options)
+    def _prepare(self, mesh: Mesh, role: str, unit: str | None, up: str | None, facing: str | None) -> Prepared:
+        return prepare(
+            mesh, role, net=self.net, kind=self.kind, num_verts=self._num_verts, unit=unit, up=up, facing=facing
+        )
 
     @torch.no_grad()
     def __call__(
@@ -152,12 +153,21 @@ class PoseTransfer:
             ValueError: an unknown option, or a mesh that cannot be used.
         """
         start = time.perf_counter()
-        other = self._prepare(pose, "pose", pose_unit, pose_up, pose_facing)
-        return self.apply(other, start)
+        return self.apply(self.prepare_pose(pose, "pose", unit=pose_unit, up=pose_up, facing=pose_facing), start)
+
+    def prepare_pose(self, pose: Mesh, name: str, *, unit: str | None, up: str | None, facing: str | None) -> Prepared:
+        """Make a pose mesh ready, for :meth:`apply`."""
+        return self._prepare(pose, name, unit, up, facing)
 
     @torch.no_grad()
-    def apply(self, other: Prepared, start: float) -> TransferResult:
-        """The transfer from a prepared pose mesh; ``start`` is when the work on it began."""
+    def apply(self, other: Prepared, start: float, *, up: Tensor | None = None) -> TransferResult:
+        """The transfer from a prepared pose mesh.
+
+        Args:
+            other: the pose mesh.
+            start: when the work on it began, by ``time.perf_counter()``.
+            up: up axis of the pose file; that of the body if ``None``.
+        """
         own, net = self.identity, self.net
         sides = {"identity_faces": own.simple.faces, "pose_faces": other.simple.faces}
         output = named(f"{own.name}, {other.name}", lambda: net.output(own.verts, other.verts, **sides))
@@ -185,9 +195,9 @@ class PoseTransfer:
             (other.clean.verts @ other.rotation.T, other.clean.faces),
             (posed, faces.to(posed.device)),
         )
-        return TransferResult(self._placed(posed, other).cpu(), faces, report, views)
+        return TransferResult(self._placed(posed, other, other.up if up is None else up).cpu(), faces, report, views)
 
-    def _placed(self, posed: Tensor, other: Prepared) -> Tensor:
+    def _placed(self, posed: Tensor, other: Prepared, up: Tensor) -> Tensor:
         """From the frame of the weights to that of a file: on the ground, and over the place, of the pose mesh."""
         own = self.identity
         metric, rotation = own.scale.fit, other.rotation
@@ -198,7 +208,7 @@ class PoseTransfer:
         in_pose_axes = posed @ rotation
         if self.frame == "pose":
             return in_pose_axes / other.scale.metres
-        turn = turn_up(other.up.cpu(), own.up.cpu()).to(posed)
+        turn = turn_up(up.cpu(), own.up.cpu()).to(posed)
         return in_pose_axes @ turn.T / own.scale.metres
 
 
