@@ -5,11 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from meshkit._numerics import launch_bound
 from meshkit.batching import check_mask
 
 __all__ = ["gather_vertices", "knn"]
 
 _TILE_ELEMENTS = 1 << 22  # distances held at once by the tiled search: 16 MiB in float32
+_OTHER_TILE_ELEMENTS = 1 << 26  # elsewhere than on a CPU
 
 
 def knn(
@@ -101,11 +103,10 @@ def _knn_tree(points: Tensor, query: Tensor, k: int, mask: Tensor | None, includ
 def _knn_tiles(points: Tensor, query: Tensor, k: int, mask: Tensor | None, include_self: bool) -> Tensor:
     batch, num = points.shape[:2]
     far = torch.finfo(points.dtype).max
-    step = max(1, _TILE_ELEMENTS // (batch * num))
+    step = max(1, (_OTHER_TILE_ELEMENTS if launch_bound(points) else _TILE_ELEMENTS) // (batch * num))
     rows = []
     for start in range(0, query.shape[1], step):
-        # The direct form keeps tiny distances exact, where |a|^2 - 2ab + |b|^2 would lose them.
-        tile = torch.cdist(query[:, start : start + step], points, compute_mode="donot_use_mm_for_euclid_dist")
+        tile = _squared_distances(query[:, start : start + step], points)
         # As in the tree, what is not finite is far away, but nearer than padding.
         tile = torch.nan_to_num(tile, nan=far, posinf=far)
         if mask is not None:
@@ -114,6 +115,18 @@ def _knn_tiles(points: Tensor, query: Tensor, k: int, mask: Tensor | None, inclu
             tile[:, :, start : start + step].diagonal(dim1=1, dim2=2).fill_(torch.inf)
         rows.append(tile.topk(k, dim=2, largest=False).indices)
     return torch.cat(rows, 1)
+
+
+def _squared_distances(query: Tensor, points: Tensor) -> Tensor:
+    """``(B, Q, N)``. The direct form keeps tiny distances exact, where |a|^2 - 2ab + |b|^2 would lose them.
+
+    Coordinate by coordinate: cdist without that product is forty times slower on a GPU.
+    """
+    total = query.new_zeros(len(query), query.shape[1], points.shape[1])
+    for a, b in zip(query.unbind(2), points.unbind(2), strict=True):
+        difference = a[:, :, None] - b[:, None]
+        total.addcmul_(difference, difference)
+    return total
 
 
 def gather_vertices(x: Tensor, index: Tensor) -> Tensor:

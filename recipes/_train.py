@@ -13,7 +13,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from typing import Any, cast
 
 import torch
@@ -38,47 +38,107 @@ def learning_rate(cfg: Settings, s: int, steps: int) -> float:
     return cfg.lr * rise * fall
 
 
-def train_step(
-    fabric: Fabric, system: Any, optimizer: Any, batch: PairBatch, cfg: Settings, step: Step, s: int, steps: int
-) -> dict[str, float]:
-    """One update; everything random in it follows from the seed and the step."""
-    torch.manual_seed(cfg.seed * 1_000_003 + s * 7919 + fabric.global_rank)
-    for group in optimizer.param_groups:
-        group["lr"] = learning_rate(cfg, s, steps)
-    where = f"at step {s} (identities {batch.identity_index.tolist()}, poses {batch.pose_index.tolist()})"
-    advice = "training has diverged. Begin again under another --name with a smaller --lr"
-    try:
-        losses = step(system, batch, cfg, s / steps)
-    except ValueError as error:
-        raise UserError(f"{error} {where}: {advice}") from None
-    total = torch.stack(list(losses.values())).sum()
-    optimizer.zero_grad()
-    fabric.backward(total)
-    # Weights that turn NaN would be saved; they are looked at before, not after, the update.
-    norm = torch.nn.utils.get_total_norm(p.grad for p in system.parameters() if p.grad is not None)
-    # One transfer tells everything: on a GPU each waits for all that was launched.
-    *values, loss, size = torch.stack([*losses.values(), total, norm]).tolist()
-    if not math.isfinite(loss + size):
-        raise UserError(f"the loss is {loss}, its gradient {size} {where}: {advice}")
-    optimizer.step()
-    return dict(zip(losses, values, strict=True)) | {"loss": loss}
+class Trainer:
+    """What one update needs: the trained module, its optimiser, and the recipe's step."""
+
+    def __init__(self, fabric: Fabric, system: Any, optimizer: Any, cfg: Settings, step: Step, steps: int) -> None:
+        self.fabric, self.system, self.optimizer = fabric, system, optimizer
+        self.cfg, self.step, self.steps = cfg, step, steps
+        self.graphed: GraphedStep | None = None
+
+    def update(self, batch: PairBatch, s: int) -> dict[str, float]:
+        """One update; everything random in it follows from the seed and the step."""
+        torch.manual_seed(self.cfg.seed * 1_000_003 + s * 7919 + self.fabric.global_rank)
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.cfg, s, self.steps)
+        try:
+            losses, total, norm = self.gradients(batch, s)
+        except ValueError as error:
+            raise UserError(f"{error} {diverged(batch, s)}") from None
+        # One transfer tells everything: on a GPU each waits for all that was launched.
+        *values, loss, size = torch.stack([*losses.values(), total, norm]).tolist()
+        # Weights that turn NaN would be saved; they are looked at before, not after, the update.
+        if not math.isfinite(loss + size):
+            raise UserError(f"the loss is {loss}, its gradient {size} {diverged(batch, s)}")
+        self.optimizer.step()
+        return dict(zip(losses, values, strict=True)) | {"loss": loss}
+
+    def gradients(self, batch: PairBatch, s: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Losses, their sum and the norm of its gradient, which is left at the parameters."""
+        cfg: Any = self.cfg
+        solving = getattr(cfg, "arap", False) and s >= cfg.arap_from * self.steps  # a solver looks at its residuals
+        if not cfg.graph or solving:
+            self.optimizer.zero_grad()
+            return self.backward(batch, s)
+        if self.graphed is None:
+            self.graphed = GraphedStep(self, batch, s)
+        return self.graphed(batch)
+
+    def backward(self, batch: PairBatch, s: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Forward and backward pass."""
+        losses = self.step(self.system, batch, self.cfg, s / self.steps)
+        total = torch.stack(list(losses.values())).sum()
+        self.fabric.backward(total)
+        gradients = [p.grad for p in self.system.parameters() if p.grad is not None]
+        return losses, total, torch.nn.utils.get_total_norm(gradients)
 
 
-def count_steps(cfg: Settings, fabric: Fabric, system: Any, optimizer: Any, step: Step, loader: Any) -> int:
-    """Steps that fit into ``cfg.minutes``, from the speed of a few steps on copies that are thrown away.
+class GraphedStep:
+    """Forward and backward pass recorded once as a CUDA graph, and replayed for each batch.
 
-    They are timed at the beginning and at the end of a run, between which a step may change at ``cfg.arap_from``.
+    A step of a small network is some ten thousand short kernels, which take longer to launch than to run.
     """
+
+    def __init__(self, trainer: Trainer, batch: PairBatch, s: int) -> None:
+        self.batch = copy.deepcopy(batch)
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        state = copy.deepcopy(trainer.system.state_dict())
+        with torch.cuda.stream(stream):  # what is set up at first use must not be part of the graph
+            for _ in range(3):
+                trainer.optimizer.zero_grad()
+                trainer.backward(self.batch, s)
+        torch.cuda.current_stream().wait_stream(stream)
+        trainer.system.load_state_dict(state)  # spectral normalisation moved on
+        trainer.optimizer.zero_grad()
+        self.graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self.graph):
+            self.results = trainer.backward(self.batch, s)
+
+    def __call__(self, batch: PairBatch) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Losses, their sum and the gradient's norm. Gradients are written, not added to what was there."""
+        for field in fields(batch):
+            value = getattr(batch, field.name)
+            if value is not None:
+                getattr(self.batch, field.name).copy_(value)
+        self.graph.replay()
+        return self.results
+
+
+def diverged(batch: PairBatch, s: int) -> str:
+    """Where, and what to do."""
+    return (
+        f"at step {s} (identities {batch.identity_index.tolist()}, poses {batch.pose_index.tolist()}): training has "
+        "diverged. Begin again under another --name with a smaller --lr"
+    )
+
+
+def count_steps(trainer: Trainer, loader: Any) -> int:
+    """Steps that fit into ``minutes``, from the speed of a few steps on copies that are thrown away.
+
+    They are timed at the beginning and at the end of a run, between which a step may change at ``arap_from``.
+    """
+    cfg, system, optimizer = trainer.cfg, trainer.system, trainer.optimizer
     if cfg.steps is not None:
         return cfg.steps
     assert cfg.minutes is not None
     weights, moments = copy.deepcopy(system.state_dict()), copy.deepcopy(optimizer.state_dict())
-    seconds = []
+    trainer.steps, seconds = 1000, []
     for first in (0, 995):
         times = []
         for s, batch in zip(range(first, first + 5), loader, strict=False):
             start = time.perf_counter()
-            train_step(fabric, system, optimizer, batch.to(fabric.device), cfg, step, s, 1000)
+            trainer.update(batch.to(trainer.fabric.device), s)
             times.append(time.perf_counter() - start)
         seconds.append(sorted(times[1:])[1])
     system.load_state_dict(weights)
@@ -107,6 +167,8 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
             device = Fabric(accelerator=cfg.accelerator, devices=1).device
             cfg = replace(cfg, precision=pick_precision(device))
         fabric = Fabric(accelerator=cfg.accelerator, devices=1, precision=cast(Any, cfg.precision))
+        if cfg.graph and fabric.device.type != "cuda":
+            raise UserError(f"--graph records CUDA kernels, but this run is on {fabric.device}: leave it out")
         torch.manual_seed(cfg.seed)
         generator, system = build(cfg)
         train_pairs, test_pairs = (side.to(fabric.device) for side in data(cfg, run, torch.get_num_threads()))
@@ -122,7 +184,8 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         sampler = PairSampler(cfg.pairs, cfg.batch, start=start, stop=stop, seed=cfg.seed)
         return pair_loader(train_pairs, sampler, workers=cfg.workers)
 
-    steps = count_steps(cfg, fabric, system, optimizer, step, loader(0, 5))
+    trainer = Trainer(fabric, system, optimizer, cfg, step, 0)
+    trainer.steps = steps = count_steps(trainer, loader(0, 5))
     cfg = replace(cfg, steps=steps)
     run.save_json("config.json", json.loads(json.dumps(asdict(cfg), default=str)))
     run.save_json("model.json", asdict(cfg.model))
@@ -143,7 +206,7 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         asked = time.perf_counter()
         batch = next(batches).to(fabric.device)
         waiting += time.perf_counter() - asked
-        losses = train_step(fabric, system, optimizer, batch, cfg, step, s, steps)
+        losses = trainer.update(batch, s)
         seconds, clock = seconds + time.perf_counter() - clock, time.perf_counter()
         bar.set_postfix({name: f"{value:.3g}" for name, value in losses.items()}, refresh=False)
         record: dict[str, Any] = {"step": s + 1, "seconds": round(seconds, 2), **losses}

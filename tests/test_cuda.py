@@ -67,7 +67,7 @@ def test_dual_step_in_float64(padded):
 def test_dual_step_in_float32(padded):
     loss, gradients = step("cuda", torch.float32, padded=padded)
     expected, truths = step("cpu", torch.float64, padded=padded)
-    assert_near(loss.double(), expected, 1e-4)
+    assert_near(loss.double(), expected, 2e-3)  # of vertices equally far to rounding, another may be a neighbour
     scale = max(truth.abs().amax().item() for truth in truths)
     for gradient, truth in zip(gradients, truths, strict=True):
         assert_near(gradient.double(), truth, 2e-2, scale=scale)

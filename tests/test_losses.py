@@ -1,5 +1,6 @@
 """Losses against literal loops over samples, vertices, faces and matrix entries."""
 
+import importlib
 import math
 
 import pytest
@@ -18,6 +19,8 @@ from meshkit.losses import (
     reconstruction_loss,
 )
 from meshkit.ot import sinkhorn
+
+edge_ratio = importlib.import_module("meshkit.losses.edge_ratio")
 
 GARBAGE = [1e20, float("nan")]
 TETRAHEDRON = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
@@ -45,6 +48,12 @@ def ragged() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, list[torch.Tenso
     """Vertices, mask and faces of a batch of two meshes of 4 and 5 vertices, 4 and 3 faces; and the meshes."""
     meshes = [rand(4, 3), rand(5, 3, seed=1)]
     return *pad(meshes), pad_faces([TETRAHEDRON, STRIP]), meshes
+
+
+@pytest.fixture(params=[False, True], ids=["by-edges", "by-faces"])
+def walk(request, monkeypatch) -> None:
+    """How edge ratios are found; face by face on devices other than the CPU."""
+    monkeypatch.setattr(edge_ratio, "launch_bound", lambda x: request.param)
 
 
 reductions = pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
@@ -153,7 +162,7 @@ def edge_ratio_literally(mesh: torch.Tensor, reference: torch.Tensor, faces: lis
 
 @reductions
 @pytest.mark.parametrize("garbage", GARBAGE)
-def test_edge_ratio_equals_loops(ragged, reduction, garbage):
+def test_edge_ratio_equals_loops(ragged, reduction, garbage, walk):
     verts, mask, faces, meshes = ragged
     reference = rand(2, 5, 3, seed=3)
     samples = [
@@ -186,7 +195,7 @@ def test_edge_ratio_is_rigid_invariant_and_linear_in_scale():
 
 
 @reductions
-def test_edge_ratio_gradient(ragged, reduction):
+def test_edge_ratio_gradient(ragged, reduction, walk):
     verts, mask, faces, _ = ragged
     leaves = [verts.requires_grad_(), rand(2, 5, 3, seed=3).requires_grad_()]
     assert gradcheck(lambda v, r: edge_ratio_loss(v, r, faces, mask=mask, reduction=reduction), leaves)

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from meshkit._numerics import launch_bound
+from meshkit.deform.batched_rotation import BatchedRotation
 from meshkit.deform.matrices import axial, cofactors_of, curvature, symmetric_product, transposed_product
 from meshkit.deform.quaternion import project
 
@@ -19,7 +21,8 @@ def closest_rotation(S: Tensor) -> Tensor:
 
     R is the unit quaternion that is the largest eigenvector of Horn's symmetric 4 x 4 matrix, found by Rayleigh
     quotient iteration and certified by the derivatives of the characteristic quartic; the few matrices that fail the
-    certificate go through an SVD. A matrix of negative determinant gets its closest proper rotation.
+    certificate go through an SVD. On a GPU it comes by repeated squaring instead, in float64, without a branch on the
+    data. A matrix of negative determinant gets its closest proper rotation.
 
     With :math:`P = R^\top S` the gradient solves
     :math:`(\operatorname{tr}(P) I - P)\,\omega = \operatorname{axl}(R^\top dS)`, :math:`dR = R[\omega]_\times`.
@@ -46,6 +49,8 @@ def closest_rotation(S: Tensor) -> Tensor:
     """
     if not S.is_floating_point() or S.shape[-2:] != (3, 3):
         raise ValueError(f"S must be a floating (..., 3, 3) tensor, got {S.dtype} {tuple(S.shape)}")
+    if launch_bound(S):
+        return BatchedRotation.apply(S.double().reshape(-1, 3, 3)).reshape(S.shape).to(S.dtype)
     matrices = S.to(torch.promote_types(S.dtype, torch.float32)).reshape(-1, 3, 3).permute(1, 2, 0).contiguous()
     rotations, _ = ClosestRotation.apply(matrices, None)
     return rotations.permute(2, 0, 1).reshape(S.shape).to(S.dtype)

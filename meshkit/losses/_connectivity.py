@@ -165,17 +165,22 @@ def connectivity(verts: Tensor, faces: Tensor) -> Connectivity:
         same = version == faces._version and connected.num == num and connected.batch in (None, batch)
         if same:
             return connected
-    check_faces(faces, num, batched=True)
-    if faces.ndim == 3 and len(faces) != batch:
-        raise ValueError(
-            f"faces {tuple(faces.shape)} must have the batch size of verts {tuple(verts.shape)}; pass (F, 3) to share "
-            "one face list"
-        )
+    check_batch_faces(verts, faces)
     with torch.inference_mode(False), torch.no_grad():  # else what is kept could not serve a later training step
         connected = _connect(faces.long(), batch if faces.ndim == 3 else None, num)
     if cached:
         _known[faces] = faces._version, connected
     return connected
+
+
+def check_batch_faces(verts: Tensor, faces: Tensor) -> None:
+    """Raise ValueError on faces that do not fit the batch."""
+    check_faces(faces, verts.shape[1], batched=True)
+    if faces.ndim == 3 and len(faces) != len(verts):
+        raise ValueError(
+            f"faces {tuple(faces.shape)} must have the batch size of verts {tuple(verts.shape)}; pass (F, 3) to share "
+            "one face list"
+        )
 
 
 def _connect(faces: Tensor, batch: int | None, num: int) -> Connectivity:

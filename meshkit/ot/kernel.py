@@ -51,10 +51,15 @@ class Ledger:
         self._pages[id(user)] = factors
         return factors[0].left.new_ones(())
 
-    def collect(self, count: int) -> list[Factors]:
-        """The factors of this backward pass. Earlier pages stem from passes that did not ask for this gradient."""
+    def collect(self, count: Tensor) -> list[Factors]:
+        """The factors of this backward pass. Earlier pages stem from passes that did not ask for this gradient.
+
+        While a CUDA graph is captured the count cannot be read; there, one whole backward pass is all there is.
+        """
         pages, self._pages = list(self._pages.values()), {}
-        return [factors for page in pages[len(pages) - count :] for factors in page]
+        if not (count.is_cuda and torch.cuda.is_current_stream_capturing()):
+            pages = pages[len(pages) - round(count.item()) :]
+        return [factors for page in pages for factors in page]
 
 
 class GibbsKernel:
@@ -87,7 +92,7 @@ class _Token(torch.autograd.Function):
     @full_precision
     def backward(ctx: Any, count: Tensor) -> tuple[Any, ...]:
         refuse_second_derivative()
-        return None, *ctx.ledger.tiles.pullback(ctx.ledger.collect(round(count.item())))
+        return None, *ctx.ledger.tiles.pullback(ctx.ledger.collect(count))
 
 
 class _Product(torch.autograd.Function):

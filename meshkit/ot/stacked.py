@@ -22,6 +22,9 @@ from meshkit.ot.options import Options
 from meshkit.ot.sample import SamplePlan
 from meshkit.ot.tiles import LOG2_E, Factors, FeatureTiles, Reference, Tiles
 
+STACK_BYTES = 1 << 27
+"""Kernels up to this size, all samples together, are stored by ``store="auto"``."""
+
 
 def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, *given: Tensor | None) -> bool:
     """Whether :func:`solve_stacked` may take the problem; ``given`` are masks and weights, which must be missing.
@@ -34,7 +37,9 @@ def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, *given: Tenso
     if options.unbalanced or settings.tol is not None or settings.scales or settings.grad not in ("unroll", "none"):
         return False
     (batch, rows, _), columns, dtype = fx.shape, fy.shape[1], torch.promote_types(fx.dtype, torch.float32)
-    if options.domain == "log" or store == "stream" or not options.keep(batch * rows * columns * dtype.itemsize):
+    if options.domain == "log" or store == "stream":
+        return False
+    if store == "auto" and batch * rows * columns * dtype.itemsize > STACK_BYTES:
         return False
     eps = float(options.eps.detach() if isinstance(options.eps, Tensor) else options.eps)
     return options.domain == "kernel" or 2 / eps <= math.log(torch.finfo(dtype).max) - math.log(rows * columns)
