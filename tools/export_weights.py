@@ -2,7 +2,7 @@
 
     python tools/export_weights.py runs/xdualnet-small xdualnet-humans
 
-Writes meshkit/weights/NAME.safetensors (parameters as float16, buffers as they are), NAME.json and NAME.md, after
+Writes meshkit/weights/NAME.safetensors (the residual blocks as float16, the rest as float32), NAME.json and NAME.md, after
 checking that the network with rounded parameters gives the run's vertices within a thousandth of a metre, and measuring
 what is usual on test pairs for the transfer's honesty report.
 """
@@ -28,6 +28,7 @@ from meshkit.transfer import confidence, usual_range
 ROOT = Path(__file__).parents[1]
 WEIGHTS = ROOT / "meshkit" / "weights"
 TOLERANCE = 1e-3  # metres
+MATCHING = ("extractor.", "theta.", "phi.")
 IGNORED = {"preset", "out", "name", "resume", "apply", "result", "threads", "accelerator", "data", "seed", "workers"}
 LICENCES = {
     "humans": {
@@ -44,8 +45,12 @@ LICENCES = {
 
 
 def rounded(state: dict[str, torch.Tensor], parameters: set[str]) -> dict[str, torch.Tensor]:
-    """Parameters as float16; buffers are few and some are small, so they stay as they are."""
-    return {key: (value.half() if key in parameters else value).contiguous() for key, value in state.items()}
+    """Parameters as float16, all but those that the matching rests on: it decides sharply, and they are few.
+
+    Buffers are few as well, and some are too small for float16.
+    """
+    short = {key for key in parameters if not key.startswith(MATCHING)}
+    return {key: (value.half() if key in short else value).contiguous() for key, value in state.items()}
 
 
 @torch.no_grad()
@@ -126,7 +131,7 @@ posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces
   ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor}, {card["precision"]}, torch
   {machine["torch"]}), finished on {card["date"]}.
 - **Split**: {card["split"]}
-- **Size**: {card["parameters"]:,} parameters, stored with 16 bits. Rounding them moves no vertex of
+- **Size**: {card["parameters"]:,} parameters, those of the residual blocks stored with 16 bits. Rounding them moves no vertex of
   {card["rounding"]["pairs"]} test pairs by more than {1e3 * card["rounding"]["largest_distance_m"]:.3f} mm.
 - **Licence**: {card["licence"]["id"]}. {card["licence"]["note"]}
 
