@@ -178,7 +178,7 @@ def test_a_folder_without_a_run_is_refused(exporter, tmp_path, monkeypatch):
 def test_rounding_that_moves_vertices_is_refused(exporter, finished_run, tmp_path, monkeypatch):
     monkeypatch.setattr(exporter, "check", lambda *_: 2e-3)
     monkeypatch.setattr(sys, "argv", ["export_weights.py", str(finished_run[0]), "x", "--out", str(tmp_path)])
-    with pytest.raises(SystemExit, match="move vertices by 2.00e-03"):
+    with pytest.raises(SystemExit, match=r"move vertices by 2\.00e-03"):
         exporter.main()
     assert list(tmp_path.iterdir()) == []
 

@@ -2,9 +2,9 @@
 
     python tools/export_weights.py runs/xdualnet-small xdualnet-humans
 
-Writes meshkit/weights/NAME.safetensors (the residual blocks as float16, the rest as float32), NAME.json and NAME.md, after
-checking that the network with rounded parameters gives the run's vertices within a thousandth of a metre, and measuring
-what is usual on test pairs for the transfer's honesty report.
+Writes meshkit/weights/NAME.safetensors (the residual blocks as float16, the rest as float32), NAME.json and NAME.md,
+after checking that the network with rounded parameters gives the run's vertices within a thousandth of a metre, and
+measuring what is usual on test pairs for the transfer's honesty report.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces
   ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor}, {card["precision"]}, torch
   {machine["torch"]}), finished on {card["date"]}.
 - **Split**: {card["split"]}
-- **Size**: {card["parameters"]:,} parameters, those of the residual blocks stored with 16 bits. Rounding them moves no vertex of
-  {card["rounding"]["pairs"]} test pairs by more than {1e3 * card["rounding"]["largest_distance_m"]:.3f} mm.
+- **Size**: {card["parameters"]:,} parameters, those of the residual blocks stored with 16 bits. Rounding them moves no
+  vertex of {card["rounding"]["pairs"]} test pairs by more than {1e3 * card["rounding"]["largest_distance_m"]:.3f} mm.
 - **Licence**: {card["licence"]["id"]}. {card["licence"]["note"]}
 
 ## Figures

@@ -157,8 +157,9 @@ def _is_weights(name: str) -> bool:
 def load_pretrained(name: str, *, device: torch.device | str = "cpu") -> PretrainedTransfer:
     """Load weights that come with meshkit, in evaluation mode.
 
-    Most parameters are stored with 16 bits; all are used as float32. ``net.card`` holds how they were trained, their figures on
-    unseen pairs, and their licence; the weights for animals are CC BY-SA 3.0, as the art they were trained on.
+    Most parameters are stored with 16 bits; all are used as float32. ``net.card`` holds how they were trained, their
+    figures on unseen pairs, and their licence; the weights for animals are CC BY-SA 3.0, as the art they were trained
+    on.
 
     Args:
         name: one of :func:`pretrained_names`, such as ``"xdualnet-humans"``.

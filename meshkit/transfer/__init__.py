@@ -2,8 +2,9 @@
 
 from meshkit.transfer.confidence import Confidence, confidence, usual_range
 from meshkit.transfer.output import save_page, save_picture
+from meshkit.transfer.report import TransferReport, TransferResult
 from meshkit.transfer.sequence import read_sequence, transfer_sequence
-from meshkit.transfer.transfer import PoseTransfer, TransferReport, TransferResult, transfer_pose
+from meshkit.transfer.transfer import PoseTransfer, transfer_pose
 
 __all__ = [
     "Confidence",

@@ -10,10 +10,11 @@ import numpy as np
 
 from meshkit.io import MeshFileError, atomic_write, save_mesh
 from meshkit.models import pretrained_names
-from meshkit.transfer.frames import UNITS
+from meshkit.transfer._frames import UNITS
 from meshkit.transfer.output import save_page, save_picture
+from meshkit.transfer.report import TransferResult
 from meshkit.transfer.sequence import is_sequence, transfer_sequence
-from meshkit.transfer.transfer import TransferResult, transfer_pose
+from meshkit.transfer.transfer import transfer_pose
 
 __all__ = ["main"]
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from meshkit.batching import center
 from meshkit.io import atomic_write
-from meshkit.transfer.transfer import TransferResult
+from meshkit.transfer.report import TransferResult
 from meshkit.viz import contact_sheet, render, save_html
 
 __all__ = ["save_page", "save_picture"]

@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from meshkit.io import MeshFileError, SurfaceBinding
-from meshkit.transfer.choose import Weights
-from meshkit.transfer.frames import find_rotation, turns_about
-from meshkit.transfer.kinds import rest_body
-from meshkit.transfer.prepare import Mesh, Prepared, named, read
-from meshkit.transfer.transfer import PoseTransfer, TransferResult
+from meshkit.transfer._choose import Weights
+from meshkit.transfer._frames import find_rotation, turns_about
+from meshkit.transfer._kinds import rest_body
+from meshkit.transfer._prepare import Mesh, Prepared, named, read
+from meshkit.transfer.report import TransferResult
+from meshkit.transfer.transfer import PoseTransfer
 
 __all__ = ["is_sequence", "read_sequence", "transfer_sequence"]
 
@@ -40,7 +41,8 @@ def read_sequence(path: str | os.PathLike[str]) -> list[Mesh]:
     """The pose meshes of a folder, an ``.npz`` or a ``.glb`` file, in order.
 
     A folder: its mesh files, sorted by name with numbers by value (``pose9`` before ``pose10``). An ``.npz`` file:
-    arrays ``verts`` (T, V, 3) and ``faces`` (F, 3). A ``.glb`` file: its meshes, in the order of the scene.
+    arrays ``verts`` (T, V, 3) and ``faces`` (F, 3). A ``.glb`` file: its meshes, sorted likewise by the names of their
+    nodes.
 
     Raises:
         MeshFileError: there is nothing there, or not what is described here.
@@ -85,12 +87,14 @@ def _npz_meshes(path: Path) -> list[tuple[Tensor, Tensor]]:
 
 
 def _glb_meshes(path: Path) -> list[tuple[Tensor, Tensor]]:
-    """The meshes of a scene if all have equal faces; else none."""
+    """The meshes of a scene by the names of their nodes, if all have equal faces; else none."""
     import trimesh
 
     try:
         scene = trimesh.load_scene(path, process=False)
-        parts: Any = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+        nodes = sorted(scene.graph.nodes_geometry, key=_natural)
+        placed = [(scene.geometry[geometry], place) for place, geometry in map(scene.graph.get, nodes)]
+        parts = [part.copy().apply_transform(place) for part, place in placed if isinstance(part, trimesh.Trimesh)]
     except Exception as error:  # trimesh raises what its readers raise
         raise MeshFileError(f"{path}: not a readable GLB file ({error})") from error
     if not parts or any(not np.array_equal(part.faces, parts[0].faces) for part in parts):

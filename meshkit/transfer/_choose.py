@@ -9,8 +9,8 @@ import torch
 
 from meshkit.io import clean_mesh, simplify
 from meshkit.models import PretrainedTransfer, load_generator, load_pretrained, pretrained_names
-from meshkit.transfer.kinds import guess_kind
-from meshkit.transfer.prepare import Mesh, named, read
+from meshkit.transfer._kinds import guess_kind
+from meshkit.transfer._prepare import Mesh, named, read
 
 __all__ = ["Weights", "choose_weights"]
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from meshkit.io import CleanMesh, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
 from meshkit.models import PretrainedTransfer
-from meshkit.transfer.frames import Scale, axis_name, find_rotation, find_scale, rotations
-from meshkit.transfer.kinds import rest_body
+from meshkit.transfer._frames import Scale, axis_name, find_rotation, find_scale, rotations
+from meshkit.transfer._kinds import rest_body
 
 __all__ = ["Mesh", "Prepared", "prepare", "read"]
 
