@@ -1,6 +1,6 @@
 """Pose transfer between any two meshes."""
 
-from meshkit.transfer.confidence import Confidence, confidence, usual_range
+from meshkit.transfer.confidence import Confidence, measure_confidence, usual_range
 from meshkit.transfer.output import save_page, save_picture
 from meshkit.transfer.report import TransferReport, TransferResult
 from meshkit.transfer.sequence import read_sequence, transfer_sequence
@@ -11,7 +11,7 @@ __all__ = [
     "PoseTransfer",
     "TransferReport",
     "TransferResult",
-    "confidence",
+    "measure_confidence",
     "read_sequence",
     "save_page",
     "save_picture",

@@ -12,7 +12,7 @@ from torch import Tensor
 from meshkit.metrics import edge_ratio
 from meshkit.models import GeneratorOutput, PretrainedTransfer
 
-__all__ = ["Confidence", "confidence", "row_entropies", "usual_range"]
+__all__ = ["Confidence", "measure_confidence", "row_entropies", "usual_range"]
 
 # Field, whether large values are the unusual ones, and what an unusual value says.
 _MEANINGS = (
@@ -56,7 +56,7 @@ class Confidence:
 
 
 @torch.no_grad()
-def confidence(
+def measure_confidence(
     net: PretrainedTransfer, identity: Tensor, pose: Tensor, *, identity_faces: Tensor, pose_faces: Tensor, output: Any
 ) -> Confidence:
     """Measure one transfer.

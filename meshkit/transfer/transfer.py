@@ -10,7 +10,7 @@ from meshkit.deform import arap_deform
 from meshkit.transfer._choose import Weights, choose_weights
 from meshkit.transfer._frames import turn_up
 from meshkit.transfer._prepare import Mesh, Prepared, named, prepare
-from meshkit.transfer.confidence import confidence
+from meshkit.transfer.confidence import measure_confidence
 from meshkit.transfer.report import TransferReport, TransferResult
 
 __all__ = ["PoseTransfer", "transfer_pose"]
@@ -112,7 +112,7 @@ class PoseTransfer:
         own, net = self.identity, self.net
         sides = {"identity_faces": own.simple.faces, "pose_faces": other.simple.faces}
         output = named(f"{own.name}, {other.name}", lambda: net.output(own.verts, other.verts, **sides))
-        numbers = confidence(net, own.verts, other.verts, **sides, output=output)
+        numbers = measure_confidence(net, own.verts, other.verts, **sides, output=output)
         small = output.vertices
         if not bool(torch.isfinite(small).all()):
             raise ValueError(f"{other.name}: the network's result is not finite; the weights cannot do this pair")
