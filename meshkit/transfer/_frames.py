@@ -10,6 +10,7 @@ from torch import Tensor
 
 from meshkit.batching import center
 from meshkit.models import PoseTransferGenerator, PretrainedTransfer
+from meshkit.topology import vertex_normals
 from meshkit.transfer.confidence import row_entropies
 
 __all__ = ["UNITS", "axis_vector", "find_rotation", "find_scale", "rotations", "turn_up", "turns_about"]
@@ -19,7 +20,7 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 _RARE = 0.7  # handicap, in log length, of inches and feet: a tall body in metres is more likely than a dwarf in feet
 _NEAR = math.log(1.6)  # sizes within this factor of the mean body are left as they are
-_CLEAR = 0.05  # nats of entropy by which an orientation must beat the file's own
+_CLEAR = 0.05  # score by which another orientation must beat the usual ones
 
 
 def axis_vector(axis: str) -> Tensor:
@@ -142,12 +143,20 @@ def find_rotation(
     *,
     reference: tuple[Tensor, Tensor],
     candidates: Tensor,
+    usual: Tensor | None = None,
 ) -> tuple[Tensor, Sequence[float]]:
-    """The rotation after which the weights match a mesh to a rest body with the least entropy.
+    r"""The rotation after which a mesh, as the weights match it, lies most like a rest body.
 
-    The networks are trained on bodies that stand in one frame, and their matching is sharpest there: so the weights
-    themselves tell how a body lies in its file, in any pose. The first candidate is kept unless another beats it
-    clearly.
+    The mesh, turned by each candidate, is matched to the rest body by the weights. Chest, back, toes and nose are told
+    apart by the matching, and their normals by the direction they look in: so the normals n of the mesh and those n' of
+    the matched places must agree, and, which counts less, so must the positions x and x' about their means, and the
+    matching must be sharp. The score is
+
+    .. math:: \mathrm{corr}(n, n') + \tfrac18 \left( \mathrm{corr}(x, x') - H \right), \qquad
+              \mathrm{corr}(a, b) = \frac{\sum_i a_i \cdot b_i}{\lVert a \rVert \, \lVert b \rVert}
+
+    with the mean entropy H, in nats, of the rows of the matching. This works in any pose, where symmetry and the
+    longest axis do not. Of two nearly equal scores the usual orientation's counts more.
 
     Args:
         net: weights with a matching.
@@ -155,9 +164,11 @@ def find_rotation(
         faces: (F, 3).
         reference: vertices and faces of a rest body in the frame of the weights.
         candidates: (R, 3, 3) rotations.
+        usual: (K, 3, 3) those of them that another must beat by 0.05, as most files have them; if ``None``, up +z,
+            facing -y, and up +y, facing +z.
 
     Returns:
-        The rotation (3, 3), and the mean entropy of the rows of the matching, in nats, of every candidate.
+        The rotation (3, 3), and the score of every candidate.
     """
     generator = net.generator
     if len(candidates) == 1:
@@ -166,15 +177,24 @@ def find_rotation(
         raise ValueError("these weights have no matching to find the orientation with: give up and facing")
     rest, rest_faces = reference[0].to(verts), reference[1].to(faces.device)
     rest_features = generator.encode(center(rest[None]), descriptors=_batched(net.describe(rest, rest_faces)))
+    surface = torch.cat([center(rest[None])[0], vertex_normals(rest, rest_faces)], 1)[None]
+    normals = vertex_normals(verts, faces)
     descriptors = _batched(net.describe(verts, faces))
-    entropies = []
+    scores = []
     for rotation in candidates.to(verts):
         turned = center((verts @ rotation.T)[None])
         plan = generator.match(generator.encode(turned, descriptors=descriptors), rest_features)
-        entropies.append(float(row_entropies(plan.dense()[0]).mean()))
-    best = min(range(len(entropies)), key=entropies.__getitem__)
-    best = 0 if entropies[0] < entropies[best] + _CLEAR else best
-    return candidates[best], entropies
+        there = plan.barycentric(surface)[0]
+        like = _correlation(turned[0] - turned[0].mean(0), there[:, :3] - there[:, :3].mean(0))
+        like = like - float(row_entropies(plan.dense()[0]).mean())
+        scores.append(_correlation(normals @ rotation.T, there[:, 3:]) + like / 8)
+    usual = torch.cat([rotations("+z", "-y"), rotations("+y", "+z")]) if usual is None else usual
+    favoured = (candidates[:, None] == usual.to(candidates)).all(-1).all(-1).any(1)
+    return candidates[int((torch.tensor(scores) + _CLEAR * favoured.cpu()).argmax())], scores
+
+
+def _correlation(a: Tensor, b: Tensor) -> float:
+    return float((a * b).sum() / (a.norm() * b.norm()).clamp_min(1e-12))
 
 
 def _batched(descriptors: Tensor | None) -> Tensor | None:

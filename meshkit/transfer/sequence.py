@@ -212,6 +212,7 @@ class _Follower:
                     simple.faces,
                     reference=rest_body(transfer.kind or ""),
                     candidates=turns_about(before.rotation),
+                    usual=before.rotation[None],
                 ),
             )
         return replace(first, name=name, clean=clean, simple=simple, rotation=rotation.to(small))
