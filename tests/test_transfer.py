@@ -6,6 +6,7 @@ transfer must be a rigid motion of the identity mesh into the frame and place of
 
 import itertools
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -17,9 +18,11 @@ from conftest import assert_near
 from torch import Tensor, nn
 
 import meshkit.transfer._choose as choose
+from meshkit.batching import center
 from meshkit.data import load_animals, load_humans, load_shipped
 from meshkit.io import MeshFileError, load_mesh, save_mesh
-from meshkit.models import GeneratorConfig, GeneratorOutput, PretrainedTransfer
+from meshkit.metrics import pmd
+from meshkit.models import GeneratorConfig, GeneratorOutput, PretrainedTransfer, pretrained_names
 from meshkit.ot import sinkhorn
 from meshkit.transfer import (
     Confidence,
@@ -37,6 +40,8 @@ from meshkit.transfer.confidence import row_entropies
 
 UPRIGHT = {"identity_up": "+z", "identity_facing": "-y", "pose_up": "+z", "pose_facing": "-y"}
 Mesh = tuple[Tensor, Tensor]
+WEIGHTS = "corenet3d-humans"
+BOUND = 1.5  # of PMD, in 1e-3 m²
 
 
 class Copy(nn.Module):
@@ -463,3 +468,72 @@ def test_the_recipe_is_the_command(monkeypatch, capsys):
     with pytest.raises(SystemExit) as caught:
         exec(compile(recipe.read_text(), recipe, "exec"), {"__name__": "__main__"})
     assert caught.value.code == 0 and "--pose-facing" in capsys.readouterr().out
+
+
+# The shipped weights on meshes of other origin
+
+
+def with_hole(mesh: Mesh) -> Mesh:
+    """Cut a hole of 8 cm into the back."""
+    verts, faces = mesh
+    near = (verts - verts[verts[:, 1].argmax()]).norm(dim=1) < 0.08
+    return verts, faces[~near[faces].any(1)]
+
+
+def with_eye(mesh: Mesh) -> Mesh:
+    """Add a ball inside the head, at the end of the vertices."""
+    eye = trimesh.creation.icosphere(1, radius=0.02)
+    place = mesh[0][mesh[0][:, 2].argmax()] - torch.tensor([0.0, 0, 0.1])
+    return torch.cat([mesh[0], torch.tensor(eye.vertices).float() + place]), torch.cat(
+        [mesh[1], torch.tensor(eye.faces).long() + len(mesh[0])]
+    )
+
+
+CASES = {
+    "3445 vertices": lambda mesh: mesh,
+    "y up, centimetres": lambda mesh: (100 * y_up(mesh[0]), mesh[1]),
+    "turned by 90 degrees": lambda mesh: (mesh[0][:, [1, 0, 2]] * torch.tensor([-1.0, 1, 1]), mesh[1]),
+    "a hole": with_hole,
+    "an eye": with_eye,
+}
+
+
+@pytest.fixture(scope="module")
+def fine_transfer():
+    """An unseen person of 6890 vertices, ready to take poses with the shipped weights."""
+    split = load_shipped("humans")[1]
+    a, p, b, q = split.test_pairs[2].tolist()
+    transfer = PoseTransfer(body_of(6890, a, p), weights=WEIGHTS)
+    return transfer, body_of(3445, b, q), body_of(6890, a, q)[0]
+
+
+@pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
+@pytest.mark.parametrize("case", CASES)
+def test_pose_meshes_of_any_origin(case, fine_transfer):
+    """The result is near the truth, in the axes and the unit of the pose mesh."""
+    transfer, pose, truth = fine_transfer
+    change = CASES[case]
+    result = transfer(change(pose))
+    posed, expected = result.verts, change((truth, transfer.identity.faces))[0][: len(truth)]
+    metre = result.report.pose.scale.metres
+    assert metre == (0.01 if case == "y up, centimetres" else 1.0)
+    assert 1e3 * float(pmd(metre * posed[None], center(metre * expected[None]))[0]) < BOUND
+
+
+@pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
+def test_strangers_are_reported(fine_transfer):
+    transfer, pose, _ = fine_transfer
+    assert transfer(pose).report.warnings == ()
+    animals = load_animals()
+    ball = trimesh.creation.icosphere(4)
+    strangers = [(animals.template, animals.faces), (torch.tensor(ball.vertices).float(), torch.tensor(ball.faces))]
+    for stranger in strangers:
+        assert transfer(stranger).report.warnings
+
+
+@pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
+def test_the_page_runs(capsys):
+    page = Path(__file__).parents[1] / "docs" / "transfer.md"
+    (block,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    exec(compile(block, page.name, "exec"), {})
+    assert "unit cm (guessed from the surface area)" in capsys.readouterr().out
