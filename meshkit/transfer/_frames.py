@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,10 +12,13 @@ from meshkit.models import PoseTransferGenerator, PretrainedTransfer
 from meshkit.topology import vertex_normals
 from meshkit.transfer.confidence import row_entropies
 
-__all__ = ["UNITS", "axis_vector", "find_rotation", "find_scale", "rotations", "turn_up", "turns_about"]
+__all__ = ["DOUBT", "UNITS", "axis_vector", "find_rotation", "find_scale", "rotations", "turn_up", "turns_about"]
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Metres in each unit."""
+
+DOUBT = 0.03
+"""Lead in score below which an orientation is in doubt."""
 
 _RARE = 0.7  # handicap, in log length, of inches and feet: a tall body in metres is more likely than a dwarf in feet
 _NEAR = math.log(1.6)  # sizes within this factor of the mean body are left as they are
@@ -144,7 +146,7 @@ def find_rotation(
     reference: tuple[Tensor, Tensor],
     candidates: Tensor,
     usual: Tensor | None = None,
-) -> tuple[Tensor, Sequence[float]]:
+) -> tuple[Tensor, float]:
     r"""The rotation after which a mesh, as the weights match it, lies most like a rest body.
 
     The mesh, turned by each candidate, is matched to the rest body by the weights. Chest, back, toes and nose are told
@@ -168,11 +170,11 @@ def find_rotation(
             facing -y, and up +y, facing +z.
 
     Returns:
-        The rotation (3, 3), and the score of every candidate.
+        The rotation (3, 3), and by how much its score is above that of the next best, below 0 if it was favoured.
     """
     generator = net.generator
     if len(candidates) == 1:
-        return candidates[0], ()
+        return candidates[0], math.inf
     if not isinstance(generator, PoseTransferGenerator):
         raise ValueError("these weights have no matching to find the orientation with: give up and facing")
     rest, rest_faces = reference[0].to(verts), reference[1].to(faces.device)
@@ -190,7 +192,10 @@ def find_rotation(
         scores.append(_correlation(normals @ rotation.T, there[:, 3:]) + like / 8)
     usual = torch.cat([rotations("+z", "-y"), rotations("+y", "+z")]) if usual is None else usual
     favoured = (candidates[:, None] == usual.to(candidates)).all(-1).all(-1).any(1)
-    return candidates[int((torch.tensor(scores) + _CLEAR * favoured.cpu()).argmax())], scores
+    score = torch.tensor(scores)
+    best = int((score + _CLEAR * favoured.cpu()).argmax())
+    others = score[torch.arange(len(score)) != best]
+    return candidates[best], float(score[best] - others.max())
 
 
 def _correlation(a: Tensor, b: Tensor) -> float:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from meshkit.io import CleanMesh, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
 from meshkit.models import PretrainedTransfer
-from meshkit.transfer._frames import Scale, axis_name, find_rotation, find_scale, rotations
+from meshkit.transfer._frames import DOUBT, Scale, axis_name, find_rotation, find_scale, rotations
 from meshkit.transfer._kinds import rest_body
 
 __all__ = ["Mesh", "Prepared", "prepare", "read"]
@@ -156,10 +156,11 @@ def _rotation(
         if up is None or facing is None:
             raise ValueError("up and facing are not clear, and these weights do not say what they know: give both")
         return rotations(up, facing)[0], "guessed from symmetry and feet"
-    rotation, _ = find_rotation(
+    rotation, lead = find_rotation(
         net, simple.verts, simple.faces, reference=rest_body(kind), candidates=rotations(up, facing)
     )
-    return rotation, "found by matching to a rest body" if up is None and facing is None else "partly given"
+    found = "found by matching to a rest body" if up is None and facing is None else "partly given"
+    return rotation, found if lead > DOUBT else f"{found}, in doubt: give it if it is wrong"
 
 
 def named(name, make):  # type: ignore[no-untyped-def]
