@@ -12,7 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from meshkit.io import MeshFileError, MeshFileWarning, _readers, atomic_write, load_mesh, save_mesh
+from meshkit.io import MeshFileError, MeshFileWarning, _text_readers, atomic_write, load_mesh, save_mesh
 
 FORMATS_WITH_VERTICES = ["obj", "off", "ply", "glb"]
 
@@ -219,7 +219,7 @@ def test_atomic_write_replaces_whole_files_only(tmp_path: Path) -> None:
 @pytest.mark.parametrize("batch", [60, 2**25])
 def test_obj_reads_the_same_in_any_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: int) -> None:
     """Plain batches are parsed at once, others line by line: both give what trimesh reads."""
-    monkeypatch.setattr(_readers, "_BATCH_BYTES", batch)
+    monkeypatch.setattr(_text_readers, "_BATCH_BYTES", batch)
     rng = np.random.default_rng(0)
     points = rng.normal(size=(40, 3)).round(4)
     faces = rng.integers(1, 41, (70, 3))
@@ -239,7 +239,7 @@ def test_obj_reads_the_same_in_any_batches(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_off_rows_in_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_readers, "_BATCH_LINES", 2)
+    monkeypatch.setattr(_text_readers, "_BATCH_LINES", 2)
     (tmp_path / "m.off").write_text(
         "OFF\n5 3 0\n" + "0 0 0\n1 0 0\n1 1 0\n0 1 0\n2 2 2\n" + "3 0 1 2\n5 0 1 2 3 4 9 9\n3 2 1 4\n"
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from meshkit.data import RiggedModel, load_humans
 from meshkit.io import SurfaceBinding, _pymeshlab, clean_mesh, mesh_report, simplify
-from meshkit.topology import face_normals
+from meshkit.topology import cotangent_laplacian, face_normals, mass_matrix
 
 NAN = float("nan")
 
@@ -293,6 +293,48 @@ def test_weights_are_those_of_the_closest_point() -> None:
     assert (binding.weights >= 0).all() and torch.allclose(binding.weights.sum(1), torch.ones(300, dtype=torch.float64))
     squared = igl.point_mesh_squared_distance(cloud.numpy(), small.verts.numpy(), small.faces.numpy())[0]
     assert (cloud - foot).square().sum(1).numpy() == pytest.approx(squared, rel=1e-6, abs=1e-9)
+
+
+def test_carry_is_the_minimum_of_its_energy() -> None:
+    """The equations of the docstring, term by term, as one dense least-squares problem."""
+    verts, faces = SPHERE
+    small = simplify(verts, faces, 40)
+    moved = small.verts * torch.tensor([1.0, 1.5, 0.7]) + 0.1 * rand(40, 3)
+    coarse, corner = small.verts, small.faces[small.binding.face]
+
+    def frames(v: Tensor) -> tuple[Tensor, Tensor]:
+        a, b, c = v[small.faces].unbind(1)
+        normal = torch.linalg.cross(b - a, c - a)
+        area = normal.norm(dim=1)
+        return torch.stack([b - a, c - a, normal / area[:, None]], dim=2), area
+
+    before, area = frames(coarse)
+    gradients = frames(moved)[0] @ torch.linalg.inv(before)
+    maps = torch.stack([
+        sum(area[f] * gradients[f] for f in range(len(area)) if i in small.faces[f])
+        / sum(area[f] for f in range(len(area)) if i in small.faces[f])
+        for i in range(40)
+    ])  # fmt: skip
+    weights = small.binding.weights
+    follow = torch.stack([
+        sum(w * (moved[k] + maps[k] @ (v - coarse[k])) for w, k in zip(ws, ks, strict=True))
+        for v, ws, ks in zip(verts, weights, corner, strict=True)
+    ])  # fmt: skip
+    bend = torch.einsum("vk,vkij->vij", weights, maps[corner])
+    edges = torch.cat([small.faces[:, [0, 1]], small.faces[:, [1, 2]], small.faces[:, [2, 0]]])
+    h = (coarse[edges[:, 0]] - coarse[edges[:, 1]]).norm(dim=1).mean()
+    stiffness = cotangent_laplacian(verts, faces).to_dense()
+    rows, right = [], []
+    for i, j in torch.nonzero(torch.triu(stiffness, 1) < 0).tolist():
+        root = (-stiffness[i, j]).sqrt()
+        row = torch.zeros(len(verts), dtype=torch.float64)
+        row[i], row[j] = root, -root
+        rows.append(row)
+        right.append(root * (bend[i] + bend[j]) / 2 @ (verts[i] - verts[j]))
+    pull = (25 / h**2 * mass_matrix(verts, faces, kind="barycentric")).sqrt()
+    system = torch.cat([torch.stack(rows), torch.diag(pull)])
+    expected = torch.linalg.lstsq(system, torch.cat([torch.stack(right), pull[:, None] * follow])).solution
+    torch.testing.assert_close(small.carry(moved), expected, rtol=0, atol=1e-6)
 
 
 class FilterlessMeshSet:

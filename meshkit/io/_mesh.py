@@ -1,6 +1,6 @@
 """What the parts of ``meshkit.io`` share: one check of a mesh in memory, and small pieces of triangle geometry."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +11,14 @@ from meshkit.topology import check_faces
 
 Points = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+
+class Parsed(NamedTuple):
+    """A mesh as read; ``polygons`` counts the faces of the file with more than three corners."""
+
+    verts: Points
+    faces: Indices
+    polygons: int = 0
 
 
 def as_arrays(verts: Tensor, faces: Tensor) -> tuple[Points, Indices]:
@@ -70,3 +78,16 @@ def components(pairs: Indices, count: int) -> Indices:
     graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     labels: Any = connected_components(graph, directed=False)[1]
     return np.asarray(labels, dtype=np.int64)
+
+
+def corner_fans(triangles: Indices) -> Indices:
+    """Number of the fan that each corner belongs to (F, 3): faces that share an edge at a vertex are one fan of it."""
+    count = len(triangles)
+    # Corner k of face f is 3f + k. Corners at one end of one edge are chained.
+    face, side = np.tile(np.arange(count), 3), np.repeat(np.arange(3), count)
+    corner = np.concatenate([3 * face + side, 3 * face + (side + 1) % 3])
+    vertex, edge = triangles.reshape(-1)[corner], np.tile(edge_numbers(triangles)[1], 2)
+    order = np.lexsort((vertex, edge))
+    same = (np.diff(edge[order]) == 0) & (np.diff(vertex[order]) == 0)
+    pairs = np.stack([corner[order][:-1][same], corner[order][1:][same]], axis=1)
+    return components(pairs, 3 * count).reshape(-1, 3)

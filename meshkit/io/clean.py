@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from meshkit.io._mesh import Indices, Points, area_vectors, as_arrays, as_tensors, components, edge_numbers
+from meshkit.io._manifold import edge_manifold, face_components, orient_faces, split_fans, weld_vertices
+from meshkit.io._mesh import area_vectors, as_arrays, as_tensors
 from meshkit.io.binding import SurfaceBinding
 
 __all__ = ["CleanMesh", "clean_mesh"]
@@ -121,7 +122,7 @@ def clean_mesh(
         if count:
             changes[what] = count
 
-    target = _weld(points, weld)
+    target = weld_vertices(points, weld)
     kept = np.unique(target)
     note("vertices welded", len(points) - len(kept))
     triangles = target[triangles]
@@ -137,20 +138,20 @@ def clean_mesh(
         raise ValueError("nothing is left: every face repeats a corner, after welding")
 
     count = len(triangles)
-    triangles = _edge_manifold(points, triangles)
+    triangles = edge_manifold(points, triangles)
     note("faces at an edge of more than two removed", count - len(triangles))
     if keep_largest:
-        label, count = _face_components(triangles), len(triangles)
+        label, count = face_components(triangles), len(triangles)
         areas = np.bincount(label, np.linalg.norm(area_vectors(points, triangles), axis=1))
         note("smaller parts removed", len(areas) - 1)
         triangles = triangles[label == areas.argmax()]
         note("faces of smaller parts removed", count - len(triangles))
 
-    fan, triangles = _split_fans(triangles, len(points))  # fan: vertex that each row past the original ones copies
+    fan, triangles = split_fans(triangles, len(points))  # fan: vertex that each row past the original ones copies
     note("vertices split where fans of faces touched", len(fan))
     origin = np.concatenate([np.arange(len(points)), fan])
     if orient:
-        turned = _orient(points[origin], triangles)
+        turned = orient_faces(points[origin], triangles)
         note("faces turned", int((turned[:, 1] != triangles[:, 1]).sum()))
         triangles = turned
 
@@ -164,94 +165,3 @@ def clean_mesh(
     return CleanMesh(
         clean_verts, clean_faces, source, torch.from_numpy(row[target]).to(verts.device), changes, verts.detach()
     )
-
-
-def _weld(points: Points, weld: float | None) -> Indices:
-    """For each vertex the first vertex at the same place."""
-    if weld is None:
-        return np.arange(len(points))
-    _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
-    same = first[inverse.reshape(-1)]
-    if weld > 0:
-        from scipy.spatial import cKDTree
-
-        radius = weld * float(np.linalg.norm(np.ptp(points, axis=0)))
-        pairs = cKDTree(points[first]).query_pairs(radius, output_type="ndarray")
-        joined = np.concatenate([first[pairs], np.stack([np.arange(len(points)), same], axis=1)])
-        label = components(joined, len(points))
-        same = np.unique(label, return_index=True)[1][label]
-    return np.asarray(same, dtype=np.int64)
-
-
-def _edge_manifold(points: Points, triangles: Indices) -> Indices:
-    """Remove the smallest face at every edge of more than two faces until there is no such edge."""
-    area = np.linalg.norm(area_vectors(points, triangles), axis=1)
-    while True:
-        number = edge_numbers(triangles)[1]
-        crowded = np.bincount(number) > 2
-        if not crowded.any():
-            return triangles
-        face = np.tile(np.arange(len(triangles)), 3)
-        order = np.lexsort((area[face], number))
-        smallest = order[np.flatnonzero(np.diff(number[order], prepend=-1))]
-        keep = np.ones(len(triangles), dtype=bool)
-        keep[face[smallest[crowded[number[smallest]]]]] = False
-        triangles, area = triangles[keep], area[keep]
-
-
-def _inner_edges(triangles: Indices) -> tuple[Indices, Indices]:
-    """Rows of ``directed_edges`` that are the two sides of one edge."""
-    number = edge_numbers(triangles)[1]
-    order = np.argsort(number, kind="stable")
-    twin = np.flatnonzero(np.diff(number[order]) == 0)
-    return order[twin], order[twin + 1]
-
-
-def _face_components(triangles: Indices) -> Indices:
-    first, second = _inner_edges(triangles)
-    return components(np.stack([first, second], axis=1) % len(triangles), len(triangles))
-
-
-def _split_fans(triangles: Indices, num_verts: int) -> tuple[Indices, Indices]:
-    """Give every fan of faces but the first at a vertex a copy of it: the vertices copied, and the new faces.
-
-    Two corners belong to one fan when their faces share an edge at the vertex.
-    """
-    count = len(triangles)
-    first, second = _inner_edges(triangles)
-    pairs = []
-    for end in (0, 1):  # corners of row k*F + f are corner k and k+1 of face f
-        one = (first // count + end) % 3 * count + first % count
-        vertex = triangles.T.reshape(-1)[one]
-        for other_end in (0, 1):
-            other = (second // count + other_end) % 3 * count + second % count
-            same = triangles.T.reshape(-1)[other] == vertex
-            pairs.append(np.stack([one[same], other[same]], axis=1))
-    fan = components(np.concatenate(pairs), 3 * count)
-    vertex = triangles.T.reshape(-1)
-    head = np.unique(fan, return_index=True)[1]  # a corner of each fan
-    order = head[np.lexsort((head, vertex[head]))]
-    again = order[np.flatnonzero(np.diff(vertex[order], prepend=-1) == 0)]
-    row = np.arange(fan.max() + 1)
-    row[fan[order]] = vertex[order]
-    row[fan[again]] = num_verts + np.arange(len(again))
-    return vertex[again], np.ascontiguousarray(row[fan].reshape(3, count).T)
-
-
-def _orient(points: Points, triangles: Indices) -> Indices:
-    import igl
-
-    oriented, part = igl.bfs_orient(triangles)
-    oriented, part = np.asarray(oriented, dtype=np.int64), np.asarray(part).reshape(-1)
-    for label in range(int(part.max()) + 1):
-        members = part == label
-        corners = points[oriented[members]] - points[oriented[members]].mean((0, 1))
-        volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-        size = np.linalg.norm(area_vectors(points, oriented[members]), axis=1).sum() ** 1.5
-        if volume < -1e-9 * size:  # a flat piece has no outside
-            oriented[members] = oriented[members][:, [0, 2, 1]]
-    # A cyclic shift of the corners is no turn.
-    agrees = (oriented == triangles).all(1)
-    for shift in (1, 2):
-        agrees |= (np.roll(oriented, shift, 1) == triangles).all(1)
-    return np.where(agrees[:, None], triangles, triangles[:, [0, 2, 1]])

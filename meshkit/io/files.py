@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from meshkit.io._readers import read_binary, read_obj, read_off
+from meshkit.io._binary_readers import read_binary
+from meshkit.io._text_readers import read_obj, read_off
 from meshkit.io.atomic import atomic_write
 
 __all__ = ["MeshFileError", "MeshFileWarning", "load_mesh", "save_mesh"]

@@ -6,7 +6,7 @@ import numpy as np
 from torch import Tensor
 
 from meshkit.io._frame_guess import guess_frame, guess_unit
-from meshkit.io._mesh import Indices, area_vectors, as_arrays, components, directed_edges, edge_numbers
+from meshkit.io._mesh import Indices, area_vectors, as_arrays, components, corner_fans, directed_edges, edge_numbers
 
 __all__ = ["MeshReport", "mesh_report"]
 
@@ -195,17 +195,8 @@ def _loops(edges: Indices) -> int:
 
 
 def _touching(triangles: Indices, num_verts: int) -> int:
-    """Vertices whose faces, joined where they share an edge at the vertex, form more than one fan."""
+    """Vertices whose faces form more than one fan."""
     if len(triangles) == 0:
         return 0
-    count = len(triangles)
-    # Node 3f + k is corner k of face f. Corners at one end of one edge are chained.
-    face, side = np.tile(np.arange(count), 3), np.repeat(np.arange(3), count)
-    node = np.concatenate([3 * face + side, 3 * face + (side + 1) % 3])
-    vertex, edge = triangles.reshape(-1)[node], np.tile(edge_numbers(triangles)[1], 2)
-    order = np.lexsort((vertex, edge))
-    same = (np.diff(edge[order]) == 0) & (np.diff(vertex[order]) == 0)
-    pairs = np.stack([node[order][:-1][same], node[order][1:][same]], axis=1)
-    fan = components(pairs, 3 * count)
-    fans = np.unique(np.stack([triangles.reshape(-1), fan], axis=1), axis=0)[:, 0]
-    return int((np.bincount(fans, minlength=num_verts) > 1).sum())
+    pairs = np.stack([triangles.reshape(-1), corner_fans(triangles).reshape(-1)], axis=1)
+    return int((np.bincount(np.unique(pairs, axis=0)[:, 0], minlength=num_verts) > 1).sum())

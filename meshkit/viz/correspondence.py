@@ -21,7 +21,10 @@ MeshLike = tuple[Tensor | ArrayLike, Tensor | ArrayLike]
 
 
 def position_colors(verts: Tensor | ArrayLike) -> Array:
-    """A colour per vertex that says where it is: the three coordinates mixed into light, distinct colours.
+    """A colour per vertex that says where it is.
+
+    Hue runs along the longest axis; along the second one, left to right for a standing body, colours grow pale, and
+    along the third they grow bright. So a match that confuses left and right shows.
 
     Args:
         verts: (V, 3) coordinates.
@@ -39,14 +42,13 @@ def position_colors(verts: Tensor | ArrayLike) -> Array:
     points = as_array(verts)
     if points.ndim != 2 or points.shape[1:] != (3,) or len(points) == 0 or not np.isfinite(points).all():
         raise ValueError(f"verts must be finite (V, 3) coordinates of a vertex or more, got shape {points.shape}")
-    extent = np.maximum(np.ptp(points, axis=0), 1e-12 * max(np.ptp(points), 1e-300))
-    x, y, z = ((points - points.min(0)) / extent).T
-    # Hue turns along the longest axis, and the two others shift it and lighten it: neighbours stay close in colour.
-    along, across, deep = np.stack([x, y, z])[np.argsort(-extent, kind="stable")]
-    hue = 0.78 * along + 0.22 * across
+    along, across, deep = np.argsort(-np.ptp(points, axis=0), kind="stable")
+    # Ranks tell a left leg from a right one, which lie close together within the span of the arms.
+    hue = 0.70 * _share(points[:, along]) + 0.12 * _rank(points[:, across])
     base = 0.5 + 0.5 * np.cos(2 * np.pi * (hue[:, None] - np.array([0.0, 1 / 3, 2 / 3])))
-    light = (0.10 + 0.25 * deep + 0.15 * across)[:, None]
-    return np.asarray((1 - light) * base + light).clip(0, 1)
+    white = (0.05 + 0.60 * _rank(points[:, across]))[:, None]
+    bright = (0.72 + 0.28 * _rank(points[:, deep]))[:, None]
+    return np.asarray(bright * ((1 - white) * base + white)).clip(0, 1)
 
 
 def transfer_colors(colors: Tensor | ArrayLike, matches: Tensor | ArrayLike) -> Array:
@@ -159,6 +161,18 @@ def correspondence_figure(
     for side, title in enumerate(titles or ()):
         paste_title(sheet, title, (side * size[0] + size[0] // 2, room // 2 + 2), round(0.55 * room), size[0])
     return sheet
+
+
+def _share(values: Array) -> Array:
+    """Values between their smallest, 0, and their largest, 1."""
+    return (values - values.min()) / max(float(np.ptp(values)), 1e-300)
+
+
+def _rank(values: Array) -> Array:
+    """Share of the values that lie below each, equal for equal values."""
+    ordered = np.sort(values)
+    below = np.searchsorted(ordered, values, "left") + np.searchsorted(ordered, values, "right") - 1
+    return np.asarray(below / (2 * max(len(values) - 1, 1)))
 
 
 def _match_indices(matches: Array, count: int) -> NDArray[np.int64]:

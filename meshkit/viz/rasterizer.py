@@ -11,7 +11,7 @@ from meshkit.viz._mesh import CLAY, GAMMA, Array, as_array, check_colors, check_
 
 __all__ = ["error_colors", "render"]
 
-_CHUNK = 2**19  # candidate pixels expanded at a time; bounds the memory of large pictures
+_CHUNK = 2**16  # candidate pixels expanded at a time; bounds the memory of large pictures, and stays in the cache
 
 # Camera space: x right, y up, z towards the viewer. Direction, strength.
 _KEY = ((-0.55, 0.60, 0.58), 0.88)
@@ -147,20 +147,23 @@ def rasterize(
     ends = np.cumsum(counts)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(ends // _CHUNK)) + 1, [len(drawn)]])
     for first, last in pairwise(starts):
-        count = counts[first:last]
-        face = np.repeat(drawn[first:last], count)
-        offset = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
-        column = low[face, 0] + offset % box[face, 0]
-        row = low[face, 1] + offset // box[face, 0]
-        dx, dy = x[face] - (column[:, None] + 0.5), y[face] - (row[:, None] + 0.5)
-        inner = np.stack([dx[:, i] * dy[:, j] - dx[:, j] * dy[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
-        inner /= area[face, None]
-        inside = (inner >= -1e-9).all(1)
-        face, inner, pixel = face[inside], inner[inside], (row * width + column)[inside]
-        distance = (inner * depth[face]).sum(1)
+        # One array per coordinate: columns of a (P, 3) array are slow to combine.
+        faces, count = drawn[first:last], counts[first:last]
+        which = np.repeat(np.arange(len(faces)), count)
+        offset = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+        row, column = np.divmod(offset, box[faces, 0][which])
+        row, column = row + low[faces, 1][which], column + low[faces, 0][which]
+        dx = [x[faces, k][which] - (column + 0.5) for k in range(3)]
+        dy = [y[faces, k][which] - (row + 0.5) for k in range(3)]
+        inverse = (1 / area[faces])[which]
+        inner = [(dx[i] * dy[j] - dx[j] * dy[i]) * inverse for i, j in ((1, 2), (2, 0), (0, 1))]
+        inside = np.flatnonzero((inner[0] >= -1e-9) & (inner[1] >= -1e-9) & (inner[2] >= -1e-9))
+        face, pixel = faces[which[inside]], (row * width + column)[inside]
+        inner = [weight[inside] for weight in inner]
+        distance = inner[0] * depth[face, 0] + inner[1] * depth[face, 1] + inner[2] * depth[face, 2]
         np.maximum.at(nearest, pixel, distance)
         won = distance == nearest[pixel]
-        owner[pixel[won]], weights[pixel[won]] = face[won], inner[won]
+        owner[pixel[won]], weights[pixel[won]] = face[won], np.stack(inner, axis=1)[won]
     hit = np.flatnonzero(owner >= 0)
     return hit, owner[hit], weights[hit]
 

@@ -1,34 +1,23 @@
-"""Readers of the mesh formats: vertices as they stand in the file, polygons as triangles.
+"""Readers of OBJ and OFF files: vertices as they stand in the file, polygons as triangles.
 
 Text is read in batches, so that what is held beside the result does not grow with the file. A batch is parsed at once
 where its lines are all alike, and line by line where they are not, which also finds the line to blame.
 """
 
-import json
 import re
-import struct
 from collections.abc import Callable, Iterator
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshkit.io._mesh import Indices, Points
+from meshkit.io._mesh import Indices, Parsed, Points
 
 _BATCH_BYTES = 2**25
 _BATCH_LINES = 2**18
 _VERTEX = (b"v ", b"v\t")
 _FACE = (b"f ", b"f\t")
 _SLASHES = re.compile(rb"/\S*")
-
-
-class Parsed(NamedTuple):
-    """A mesh as read; ``polygons`` counts the faces of the file with more than three corners."""
-
-    verts: Points
-    faces: Indices
-    polygons: int = 0
 
 
 def fan(polygons: Indices) -> Indices:
@@ -177,87 +166,3 @@ def _off_faces(rows: list[bytes], first: int, mesh: _Growing) -> None:
             raise ValueError(f"face {number} lists {len(corners)} of its {size} vertices")
         polygons.append(corners)
     mesh.add_mixed(polygons)
-
-
-def read_binary(path: Path, limit: int) -> Parsed:
-    """PLY, STL and GLB through trimesh."""
-    import trimesh
-
-    extension = path.suffix.lower()
-    if extension in (".glb", ".stl"):
-        (_check_glb if extension == ".glb" else _check_stl)(path)
-    # fix_texture would repeat the vertices of a PLY along its texture seams.
-    options: dict[str, Any] = {"fix_texture": False} if extension == ".ply" else {}
-    scene = trimesh.load_scene(path, process=False, **options)
-    uses = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
-    bytes_needed = 24 * sum(len(part.vertices) + len(getattr(part, "faces", ())) for part in uses)
-    if bytes_needed > max(limit, 2**20):  # a small file can place one mesh many times
-        raise ValueError(f"its {len(uses)} meshes would take {bytes_needed / 2**20:,.0f} MiB, more than max_bytes")
-    parts = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh | trimesh.PointCloud)]
-    if not parts:
-        raise ValueError("no mesh in it")
-    triangles = [np.asarray(getattr(part, "faces", np.empty((0, 3))), dtype=np.int64) for part in parts]
-    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    verts = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts])
-    faces = np.concatenate([part + offset for part, offset in zip(triangles, offsets, strict=True)])
-    if extension == ".stl":
-        return Parsed(*_weld(verts, faces))
-    return Parsed(verts, faces, _check_ply(path, verts, faces) if extension == ".ply" else 0)
-
-
-def _check_ply(path: Path, verts: Points, faces: Indices) -> int:
-    """Compare what was read with the header, since text that ends early is read as far as it goes.
-
-    Returns the number of faces in the header if there were polygons among them, else 0.
-    """
-    declared = {"vertex": 0, "face": 0}
-    with path.open("rb") as stream:
-        for line in islice(stream, 1000):
-            if line.startswith(b"end_header"):
-                break
-            words = line.split()
-            if words[:1] == [b"element"] and len(words) == 3 and words[1].decode() in declared:
-                declared[words[1].decode()] = int(words[2])
-    if len(verts) != declared["vertex"] or len(faces) < declared["face"]:
-        raise ValueError(
-            f"truncated: the header declares {declared['vertex']} vertices and {declared['face']} faces, "
-            f"{len(verts)} and {len(faces)} are there"
-        )
-    return declared["face"] if len(faces) > declared["face"] else 0
-
-
-def _check_stl(path: Path) -> None:
-    """Text is read as far as it goes; the end must be there."""
-    with path.open("rb") as stream:
-        start = stream.read(1024)
-        stream.seek(max(path.stat().st_size - 1024, 0))
-        end = stream.read()
-    if start.lstrip()[:5].lower() == b"solid" and b"facet" in start and b"endsolid" not in end.lower():
-        raise ValueError("truncated: there is no endsolid")
-
-
-def _check_glb(path: Path) -> None:
-    """Refuse arrays that are longer than the file: one without data reads as so many zeros."""
-    size = path.stat().st_size
-    with path.open("rb") as stream:
-        head = stream.read(20)
-        if len(head) < 20 or head[:4] != b"glTF":
-            raise ValueError("it does not start with glTF")
-        _, _, length, chunk, kind = struct.unpack("<4sIII4s", head)
-        if kind != b"JSON" or length != size or chunk > size:
-            raise ValueError(f"damaged or truncated: {size} bytes, its header says {length}")
-        tree = json.loads(stream.read(chunk))
-    if "KHR_draco_mesh_compression" in tree.get("extensionsRequired", ()):
-        raise ValueError("its meshes are compressed with Draco; export it without compression")
-    counts = [int(accessor.get("count", 0)) for accessor in tree.get("accessors", ())]
-    if max(counts, default=0) > size:
-        raise ValueError(f"an array of {max(counts)} elements cannot be in a file of {size} bytes")
-
-
-def _weld(verts: Points, faces: Indices) -> tuple[Points, Indices]:
-    """One vertex per distinct coordinate triple, in order of first appearance."""
-    _, first, inverse = np.unique(verts, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return verts[first[order]], rank[inverse.reshape(-1)][faces]
