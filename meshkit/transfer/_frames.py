@@ -12,7 +12,17 @@ from meshkit.models import PoseTransferGenerator, PretrainedTransfer
 from meshkit.topology import vertex_normals
 from meshkit.transfer.confidence import row_entropies
 
-__all__ = ["DOUBT", "UNITS", "axis_vector", "find_rotation", "find_scale", "rotations", "turn_up", "turns_about"]
+__all__ = [
+    "DOUBT",
+    "UNITS",
+    "axis_name",
+    "axis_vector",
+    "find_rotation",
+    "find_scale",
+    "rotations",
+    "turn_up",
+    "turns_about",
+]
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Metres in each unit."""
