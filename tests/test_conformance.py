@@ -33,7 +33,15 @@ from meshkit.losses import (
     ReconstructionLoss,
     SinkhornDivergenceLoss,
 )
-from meshkit.models import NPT, OrderedPoseTransferStack, PointwiseExtractor, PoseTransferGenerator, PoseTransferStack
+from meshkit.models import (
+    NPT,
+    GeneratorConfig,
+    OrderedPoseTransferStack,
+    PointwiseExtractor,
+    PoseTransferGenerator,
+    PoseTransferStack,
+    PretrainedTransfer,
+)
 from meshkit.neighbors import knn
 from meshkit.nn import ConditionalResBlock, SetConv, SetConvExtractor
 from meshkit.norm import SPADE, AdaIN, ConditionalNorm, ElaIN, SoftAdaIN, SPAdaIN
@@ -158,6 +166,11 @@ ENTRIES = {
         **PAIR,
         result=lambda o: o.vertices,
         compile=None,  # as above
+    ),
+    "PretrainedTransfer": Entry(
+        lambda: PretrainedTransfer(PoseTransferGenerator(**SMALL, residual=True), GeneratorConfig(k=4)),
+        **PAIR,
+        compile=None,  # as its generator
     ),
     "NPT-maxpool": Entry(
         lambda: NPT(encoder_widths=(4, 9)),

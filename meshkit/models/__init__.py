@@ -8,6 +8,7 @@ from meshkit.models.ordered import OrderedPoseTransferStack
 from meshkit.models.output import GeneratorOutput
 from meshkit.models.pointwise import PointwiseExtractor
 from meshkit.models.presets import GeneratorConfig, corenet3d, load_generator, npt, xdualnet
+from meshkit.models.pretrained import PretrainedTransfer, load_pretrained, pretrained_names
 from meshkit.models.released import load_released_checkpoint
 from meshkit.models.stack import PoseTransferStack
 
@@ -20,11 +21,14 @@ __all__ = [
     "PointwiseExtractor",
     "PoseTransferGenerator",
     "PoseTransferStack",
+    "PretrainedTransfer",
     "corenet3d",
     "export_onnx",
     "load_generator",
+    "load_pretrained",
     "load_released_checkpoint",
     "model_card",
     "npt",
+    "pretrained_names",
     "xdualnet",
 ]

@@ -178,10 +178,15 @@ class PoseTransferGenerator(nn.Module):
         # Signatures have long tails where a mesh has spikes; four deviations hold all that is signal.
         return ((descriptors - self.descriptor_mean) / self.descriptor_std).clamp(-4, 4)
 
-    def _match(
-        self, identity: Tensor, pose: Tensor, identity_mask: Tensor | None, pose_mask: Tensor | None
+    def match(
+        self,
+        identity: Tensor,
+        pose: Tensor,
+        *,
+        identity_mask: Tensor | None = None,
+        pose_mask: Tensor | None = None,
     ) -> TransportPlan | DensePlan:
-        """The plan between two meshes' features."""
+        """The plan between the features ``(B, N, D)`` and ``(B, M, D)`` of two meshes, which :meth:`encode` gives."""
         pair = (self.theta(identity), self.phi(pose))
         options: dict[str, Any] = {"eps": self.eps, "n_iters": self.n_iters}
         options |= {"mask_x": identity_mask, "mask_y": pose_mask}
@@ -195,7 +200,7 @@ class PoseTransferGenerator(nn.Module):
         self, identity: Tensor, pose: Tensor, positions: Tensor, identity_mask: Tensor | None, pose_mask: Tensor | None
     ) -> tuple[TransportPlan | DensePlan, Tensor]:
         """The plan between two meshes' features, and the pose mesh's positions carried by it."""
-        plan = self._match(identity, pose, identity_mask, pose_mask)
+        plan = self.match(identity, pose, identity_mask=identity_mask, pose_mask=pose_mask)
         values = positions.to(plan.dtype)
         return plan, plan.barycentric(values) if self.normalize_plan else plan @ values
 
@@ -212,7 +217,7 @@ class PoseTransferGenerator(nn.Module):
         mask = pair[2]
         mirrored = self.encode(verts * verts.new_tensor([-1.0, 1.0, 1.0]), mask=mask, descriptors=descriptors)
         targets, others = (self._warp(f, *pair)[1] for f in (features, mirrored))
-        partners = self._match(mirrored, features, mask, mask).argmax()
+        partners = self.match(mirrored, features, identity_mask=mask, pose_mask=mask).argmax()
         labels = []
         for b in range(len(verts)):
             real = slice(None) if mask is None else mask[b].nonzero()[:, 0]

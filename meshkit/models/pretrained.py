@@ -1,0 +1,189 @@
+"""The weights that come with meshkit, as networks that take any two meshes."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from meshkit.batching import bounding_box_center, center
+from meshkit.descriptors import intrinsic_descriptors
+from meshkit.models.generator import PoseTransferGenerator
+from meshkit.models.npt import NPT
+from meshkit.models.output import GeneratorOutput
+from meshkit.models.presets import GeneratorConfig
+
+__all__ = ["PretrainedTransfer", "load_pretrained", "pretrained_names"]
+
+
+class PretrainedTransfer(nn.Module):
+    """A generator that centres meshes, computes their descriptors itself, and puts the result where the pose mesh is.
+
+    Meshes must stand in the frame that the weights were trained in: metres, z up, facing -y;
+    :func:`meshkit.transfer.transfer_pose` brings others there. Vertices are differentiable, descriptors are constants.
+
+    Args:
+        generator: :class:`PoseTransferGenerator` or :class:`NPT`.
+        config: its configuration, which says whether it takes descriptors.
+        card: what is known about the weights; see :attr:`card`.
+
+    Attributes:
+        card: the model card's facts: command, seed, data, figures, licence. Empty for weights of one's own.
+
+    Shape:
+        ``identity (V, 3)`` or ``(B, V, 3)``, ``pose (W, 3)`` or ``(B, W, 3)``; a single mesh beside a batch serves all
+        of it, and is described and encoded once. Faces ``(F, 3)``, or per mesh ``(B, F, 3)`` padded with -1. Result
+        ``(V, 3)`` if both are single meshes, else ``(B, V, 3)``.
+
+    Raises:
+        ValueError: wrong shapes, unequal batches, fewer vertices than the network looks at, or no faces where the
+            weights use descriptors.
+
+    Example:
+        >>> config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16))
+        >>> net = PretrainedTransfer(config.build(), config)
+        >>> net(torch.randn(30, 3), torch.randn(5, 40, 3)).shape
+        torch.Size([5, 30, 3])
+    """
+
+    def __init__(
+        self, generator: PoseTransferGenerator | NPT, config: GeneratorConfig, *, card: dict[str, Any] | None = None
+    ) -> None:
+        super().__init__()
+        self.generator, self.config, self.card = generator, config, card or {}
+
+    def forward(
+        self,
+        identity: Tensor,
+        pose: Tensor,
+        *,
+        identity_faces: Tensor | None = None,
+        pose_faces: Tensor | None = None,
+        identity_mask: Tensor | None = None,
+        pose_mask: Tensor | None = None,
+    ) -> Tensor:
+        """Vertices of the identity mesh in the pose of the pose mesh."""
+        return self.output(
+            identity,
+            pose,
+            identity_faces=identity_faces,
+            pose_faces=pose_faces,
+            identity_mask=identity_mask,
+            pose_mask=pose_mask,
+        ).vertices
+
+    def output(
+        self,
+        identity: Tensor,
+        pose: Tensor,
+        *,
+        identity_faces: Tensor | None = None,
+        pose_faces: Tensor | None = None,
+        identity_mask: Tensor | None = None,
+        pose_mask: Tensor | None = None,
+    ) -> GeneratorOutput:
+        """As calling the module, with the warped mesh and the matching besides; the plan is always of a batch."""
+        single = identity.dim() == pose.dim() == 2
+        first = self._side(identity, identity_faces, identity_mask, "identity")
+        second = self._side(pose, pose_faces, pose_mask, "pose")
+        batch = max(len(first["identity"]), len(second["pose"]))
+        inputs = {name: _repeated(value, batch) for name, value in (first | second).items() if value is not None}
+        result = self.generator(**inputs)
+        where = bounding_box_center(pose if pose.dim() == 3 else pose[None], pose_mask)
+        vertices = result.vertices + where
+        warped = None if result.warped is None else result.warped + where
+        if identity_mask is not None:
+            vertices = vertices.masked_fill(~identity_mask[..., None], 0.0)
+            warped = None if warped is None else warped.masked_fill(~identity_mask[..., None], 0.0)
+        if single:
+            vertices, warped = vertices[0], None if warped is None else warped[0]
+        return GeneratorOutput(vertices, warped, result.plan)
+
+    def describe(self, verts: Tensor, faces: Tensor | None, mask: Tensor | None = None) -> Tensor | None:
+        """The descriptors ``(..., V, D)`` that the weights take of a mesh; ``None`` if they take none.
+
+        Raises:
+            ValueError: they take some, and there are no faces; or as :func:`meshkit.descriptors.intrinsic_descriptors`.
+        """
+        if self.config.descriptors == "none":
+            return None
+        if faces is None:
+            raise ValueError("these weights use descriptors of the surface: give identity_faces and pose_faces")
+        return intrinsic_descriptors(
+            verts, faces, num_signatures=self.config.num_signatures, mask=mask, method="fast"
+        ).to(verts.dtype)
+
+    def _side(self, verts: Tensor, faces: Tensor | None, mask: Tensor | None, name: str) -> dict[str, Any]:
+        """What the generator is told of one of the two meshes, or batches of meshes."""
+        if verts.dim() not in (2, 3) or verts.shape[-1] != 3:
+            raise ValueError(f"{name} must be (V, 3) or (B, V, 3), got {tuple(verts.shape)}")
+        verts = verts if verts.dim() == 3 else verts[None]
+        k = self.config.k if self.config.architecture == "matching" and self.config.extractor == "setconv" else 1
+        if verts.shape[1] < k:
+            raise ValueError(f"{name} has {verts.shape[1]} vertices; these weights look at {k} neighbours of each")
+        descriptors = self.describe(verts, faces, mask)
+        centred = center(verts, mask)
+        sides: dict[str, Any] = {name: centred, f"{name}_mask": mask}
+        if isinstance(self.generator, PoseTransferGenerator):
+            sides[f"{name}_descriptors"] = descriptors
+            sides[f"{name}_features"] = self.generator.encode(centred, mask=mask, descriptors=descriptors)
+        return sides
+
+
+def _repeated(value: Tensor, batch: int) -> Tensor:
+    return value.expand(batch, *value.shape[1:]) if len(value) == 1 else value
+
+
+def pretrained_names() -> list[str]:
+    """Names that :func:`load_pretrained` knows.
+
+    Example:
+        >>> all(isinstance(name, str) for name in pretrained_names())
+        True
+    """
+    folder = files("meshkit") / "weights"
+    if not folder.is_dir():
+        return []
+    return sorted(entry.name.removesuffix(".safetensors") for entry in folder.iterdir() if _is_weights(entry.name))
+
+
+def _is_weights(name: str) -> bool:
+    return name.endswith(".safetensors")
+
+
+def load_pretrained(name: str, *, device: torch.device | str = "cpu") -> PretrainedTransfer:
+    """Load weights that come with meshkit, in evaluation mode.
+
+    Most parameters are stored with 16 bits; all are used as float32. ``net.card`` holds how they were trained, their
+    figures on unseen pairs, and their licence; the weights for animals are CC BY-SA 3.0, as the art they were trained
+    on.
+
+    Args:
+        name: one of :func:`pretrained_names`, such as ``"xdualnet-humans"``.
+        device: where to put them.
+
+    Raises:
+        ValueError: no weights of that name.
+
+    Example:
+        >>> from meshkit.data import load_humans
+        >>> body = load_humans()
+        >>> identity, pose = body(torch.tensor([3, 50]), torch.tensor([10, 500]))
+        >>> if "xdualnet-humans" in pretrained_names():
+        ...     net = load_pretrained("xdualnet-humans")
+        ...     posed = net(identity, pose, identity_faces=body.faces, pose_faces=body.faces)
+    """
+    from safetensors.torch import load
+
+    if name not in pretrained_names():
+        raise ValueError(f"no weights are named {name!r}; there are {', '.join(pretrained_names()) or 'none'}")
+    folder = files("meshkit") / "weights"
+    card = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    config = GeneratorConfig.from_json(json.dumps(card["model"]))
+    state = load((folder / f"{name}.safetensors").read_bytes())
+    generator = config.build()
+    generator.load_state_dict({key: v.float() if v.is_floating_point() else v for key, v in state.items()})
+    return PretrainedTransfer(generator, config, card=card).to(device).eval()

@@ -1,0 +1,140 @@
+"""The console script ``meshkit-transfer``: the pose of one mesh file for the body of another."""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshkit.io import MeshFileError, atomic_write, save_mesh
+from meshkit.models import pretrained_names
+from meshkit.transfer._frames import UNITS
+from meshkit.transfer.output import save_page, save_picture
+from meshkit.transfer.report import TransferResult
+from meshkit.transfer.sequence import is_sequence, transfer_sequence
+from meshkit.transfer.transfer import transfer_pose
+
+__all__ = ["main"]
+
+_FORMATS = (".obj", ".ply", ".off", ".stl", ".glb")
+_ROWS = 6  # of the picture of a sequence
+
+
+def parser() -> argparse.ArgumentParser:
+    """What the command takes."""
+    axes = ("+x", "-x", "+y", "-y", "+z", "-z")
+    made = argparse.ArgumentParser(
+        prog="meshkit-transfer",
+        description="Give the body of IDENTITY the pose of POSE: any two meshes (obj, ply, off, stl, glb). POSE may "
+        "also be a folder of meshes, an .npz file with verts (T, V, 3) and faces (F, 3), or a .glb file of several "
+        "meshes with equal faces: then every pose is transferred, in order.",
+        epilog=f"Weights that come with this installation: {', '.join(pretrained_names()) or 'none'}. An axis that "
+        "begins with a minus sign is written with an equals sign: --pose-facing=-y.",
+    )
+    made.add_argument("identity", type=Path, help="mesh that gives the body")
+    made.add_argument("pose", type=Path, help="mesh, or many, that give the pose")
+    made.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("posed.obj"),
+        help="file to write; for many poses posed_0000.obj and so on, or one .npz file (default: posed.obj)",
+    )
+    made.add_argument("--weights", default="auto", help="auto, a name, or the folder of a training run")
+    made.add_argument("--refine", type=float, metavar="WEIGHT", help="weight of the network's result (default: 0.1)")
+    made.add_argument("--no-refine", action="store_true", help="the network's result as it is")
+    made.add_argument(
+        "--frame", choices=("pose", "identity"), default="pose", help="axes, unit and place of the result"
+    )
+    for role in ("identity", "pose"):
+        made.add_argument(f"--{role}-up", choices=axes, help="signed axis to the head (default: found)")
+        made.add_argument(f"--{role}-facing", choices=axes, help="signed axis of the gaze (default: found)")
+        made.add_argument(f"--{role}-unit", choices=tuple(UNITS), help="unit of the file (default: guessed)")
+    made.add_argument("--device", default="cpu", help="cpu, cuda, ... (default: cpu)")
+    made.add_argument("--no-picture", action="store_true", help="no .png beside the result")
+    made.add_argument("--no-html", action="store_true", help="no .html page beside the result")
+    made.add_argument("--quiet", action="store_true", help="print warnings only")
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; a user's error is one line and exit status 2."""
+    args = parser().parse_args(arguments)
+    try:
+        run(args)
+    except OSError as error:
+        _fail(f"{error.filename or 'file'}: {error.strerror or error}")
+    except (ValueError, ImportError) as error:
+        _fail(str(error))
+
+
+def _fail(message: str) -> None:
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Transfer, write and report."""
+    many = is_sequence(args.pose)
+    suffix = args.out.suffix.lower()
+    if suffix not in (*_FORMATS, *((".npz",) if many else ())):
+        raise MeshFileError(f"{args.out}: the result is written as {', '.join(_FORMATS)}{' or .npz' if many else ''}")
+    if args.out.resolve() in (args.identity.resolve(), args.pose.resolve()):
+        raise ValueError(f"{args.out} would overwrite an input: choose another --out")
+    options: dict[str, Any] = {
+        name: getattr(args, name) for name in ("weights", "frame", "device") if getattr(args, name) is not None
+    }
+    for role in ("identity", "pose"):
+        options |= {f"{role}_{what}": getattr(args, f"{role}_{what}") for what in ("up", "facing", "unit")}
+    options["refine"] = False if args.no_refine else True if args.refine is None else args.refine
+    if many:
+        shown = _write_sequence(transfer_sequence(args.identity, args.pose, **options), args)
+    else:
+        result = transfer_pose(args.identity, args.pose, **options)
+        save_mesh(args.out, result.verts, result.faces)
+        _tell(result, args, args.out, whole=True)
+        shown = [result]
+    if not args.no_picture:
+        save_picture(args.out.with_suffix(".png"), shown)
+    if not args.no_html:
+        save_page(args.out.with_suffix(".html"), shown[-1])
+
+
+def _write_sequence(results: Iterator[TransferResult], args: argparse.Namespace) -> list[TransferResult]:
+    """Write every pose as it comes; the results that the picture shows."""
+    as_archive = args.out.suffix.lower() == ".npz"
+    frames, kept = [], []
+    step = 1
+    for number, result in enumerate(results):
+        file = args.out.with_name(f"{args.out.stem}_{number:04d}{args.out.suffix}")
+        if as_archive:
+            frames.append(result.verts.numpy())
+        else:
+            save_mesh(file, result.verts, result.faces)
+        _tell(result, args, None if as_archive else file, whole=number == 0)
+        if number % step == 0:
+            kept.append(result)
+        if len(kept) > _ROWS:  # evenly spaced ones, however many there will be
+            kept, step = kept[::2], 2 * step
+    if as_archive:
+        with atomic_write(args.out) as path:
+            np.savez_compressed(path, verts=np.stack(frames), faces=kept[0].faces.cpu().numpy())
+        if not args.quiet:
+            print(f"{args.out}: {len(frames)} poses of {len(frames[0])} vertices")
+    return kept
+
+
+def _tell(result: TransferResult, args: argparse.Namespace, file: Path | None, *, whole: bool) -> None:
+    report = result.report
+    if args.quiet:
+        for warning in report.warnings:
+            print(f"unusual: {report.pose.name}: {warning}", file=sys.stderr)
+        return
+    if whole:
+        print(report)
+    elif report.warnings:
+        print(f"{report.pose.name}: unusual: {'; '.join(report.warnings)}")
+    if file is not None:
+        print(f"{file}: {len(result.verts)} vertices")

@@ -1,0 +1,126 @@
+"""How far a transfer is from what the weights know: four numbers of it, against those of ordinary pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from meshkit.metrics import edge_ratio
+from meshkit.models import GeneratorOutput, PretrainedTransfer
+
+__all__ = ["Confidence", "measure_confidence", "row_entropies", "usual_range"]
+
+# Field, whether large values are the unusual ones, and what an unusual value says.
+_MEANINGS = (
+    ("match_spread", True, "the matching is vague: a vertex matches {value:.1%} of the pose mesh, usually {usual:.1%}"),
+    ("mutual_share", False, "few vertices match both ways: {value:.0%}, usually {usual:.0%}"),
+    ("edge_change", True, "edges change their length by {value:.0%} on average, usually {usual:.0%}"),
+    ("identity_distance", True, "the identity mesh is unlike training meshes: {value:.2f} off, usually {usual:.2f}"),
+    ("pose_distance", True, "the pose mesh is unlike training meshes: {value:.2f} off, usually {usual:.2f}"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """Numbers that tell a transfer the weights can do from one they cannot; ``None`` where weights have no such thing.
+
+    Attributes:
+        match_spread: mean over identity vertices of the perplexity (exponential of the entropy) of their row of the
+            matching, over the number of pose vertices: 0 is a sharp match, 1 no match at all.
+        mutual_share: share of identity vertices whose best match prefers them too.
+        edge_change: mean relative change of edge length from the identity mesh to the network's result.
+        identity_distance: distance of the identity mesh's mean descriptors from those of the training meshes, root mean
+            square over the signatures, in standard deviations of the single training vertices.
+        pose_distance: likewise for the pose mesh.
+    """
+
+    match_spread: float | None
+    mutual_share: float | None
+    edge_change: float
+    identity_distance: float | None
+    pose_distance: float | None
+
+    def warnings(self, usual: Mapping[str, Mapping[str, float]]) -> tuple[str, ...]:
+        """What is unusual, in words; ``usual`` is :func:`usual_range` of ordinary pairs, which model cards hold."""
+        found = []
+        for name, high_is_odd, text in _MEANINGS:
+            value, bounds = getattr(self, name), usual.get(name)
+            if value is not None and bounds is not None:
+                odd = value > bounds["limit"] if high_is_odd else value < bounds["limit"]
+                found += [text.format(value=value, usual=bounds["median"])] if odd else []
+        return tuple(found)
+
+
+@torch.no_grad()
+def measure_confidence(
+    net: PretrainedTransfer, identity: Tensor, pose: Tensor, *, identity_faces: Tensor, pose_faces: Tensor, output: Any
+) -> Confidence:
+    """Measure one transfer.
+
+    Args:
+        net: the weights.
+        identity: (V, 3) identity mesh, as the network was given it.
+        pose: (W, 3) pose mesh, likewise.
+        identity_faces: (F, 3).
+        pose_faces: (G, 3).
+        output: what ``net.output`` made of them, for one pair.
+    """
+    result: GeneratorOutput = output
+    spread = mutual = None
+    if result.plan is not None:
+        mass = result.plan.dense()[0]
+        spread = float(row_entropies(mass).exp().mean()) / len(pose)
+        forward, backward = mass.argmax(1), mass.argmax(0)
+        mutual = float((backward[forward] == torch.arange(len(forward), device=forward.device)).float().mean())
+    vertices = result.vertices if result.vertices.dim() == 3 else result.vertices[None]
+    return Confidence(
+        match_spread=spread,
+        mutual_share=mutual,
+        edge_change=float(edge_ratio(vertices, identity[None], identity_faces)[0]),
+        identity_distance=_distance(net, identity, identity_faces),
+        pose_distance=_distance(net, pose, pose_faces),
+    )
+
+
+def row_entropies(plan: Tensor) -> Tensor:
+    """Entropy (N,), in nats, of each row of a plan (N, M), taken as a distribution; 0 for a row without mass."""
+    share = plan / plan.sum(1, keepdim=True).clamp_min(torch.finfo(plan.dtype).tiny)
+    return -torch.special.xlogy(share, share).sum(1)
+
+
+def _distance(net: PretrainedTransfer, verts: Tensor, faces: Tensor) -> float | None:
+    descriptors = net.describe(verts, faces)
+    if descriptors is None:
+        return None
+    mean, std = (getattr(net.generator, f"descriptor_{name}").to(descriptors) for name in ("mean", "std"))
+    return float(((descriptors - mean) / std).mean(0)[:-1].square().mean().sqrt())  # the last channel is the size
+
+
+def usual_range(measured: Sequence[Confidence], *, quantile: float = 0.99) -> dict[str, dict[str, float]]:
+    """Median and limit of each number over ordinary pairs; a transfer beyond a limit is unusual.
+
+    Args:
+        measured: at least one :class:`Confidence` each of an ordinary pair.
+        quantile: share of the ordinary pairs within each limit.
+
+    Raises:
+        ValueError: nothing measured.
+
+    Example:
+        >>> usual_range([Confidence(0.01, 0.5, 0.1 * i, None, None) for i in range(3)])["edge_change"]["median"]
+        0.1
+    """
+    if not measured:
+        raise ValueError("the usual range needs measured pairs, got none")
+    usual = {}
+    for name, high_is_odd, _ in _MEANINGS:
+        values = [value for value in (asdict(one)[name] for one in measured) if value is not None]
+        if values:
+            numbers = torch.tensor(values, dtype=torch.float64)
+            limit = numbers.quantile(quantile if high_is_odd else 1 - quantile)
+            usual[name] = {"median": round(float(numbers.median()), 5), "limit": round(float(limit), 5)}
+    return usual

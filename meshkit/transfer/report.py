@@ -1,0 +1,73 @@
+"""What a transfer returns: the mesh, what was done, and how far to trust it."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from meshkit.transfer._prepare import Prepared
+from meshkit.transfer.confidence import Confidence
+
+__all__ = ["TransferReport", "TransferResult"]
+
+
+@dataclass(frozen=True)
+class TransferReport:
+    """What was done and how far to trust it; ``print`` it to read it.
+
+    Attributes:
+        identity: the identity mesh and what was made of it.
+        pose: the pose mesh likewise.
+        weights: which, and why.
+        confidence: numbers that tell an ordinary transfer from an unusual one.
+        warnings: what is unusual, in words; empty if nothing is.
+        calibrated: whether the weights' card says what is usual; otherwise there are no warnings from the numbers.
+        refined: weight of the network's result in the refinement; ``None`` if there was none.
+        seconds: time taken.
+    """
+
+    identity: Prepared
+    pose: Prepared
+    weights: str
+    confidence: Confidence
+    warnings: tuple[str, ...]
+    calibrated: bool
+    refined: float | None
+    seconds: float
+
+    def __str__(self) -> str:
+        numbers = self.confidence
+        facts = [f"edges change by {numbers.edge_change:.1%}"]
+        if numbers.match_spread is not None and numbers.mutual_share is not None:
+            facts.append(f"matches spread over {numbers.match_spread:.2%} of the pose mesh")
+            facts.append(f"{numbers.mutual_share:.0%} of them mutual")
+        lines = [f"identity {self.identity.name}", _indented(str(self.identity))]
+        lines += [f"pose     {self.pose.name}", _indented(str(self.pose)), f"weights  {self.weights}"]
+        lines.append(f"result   {', '.join(facts)}; {self.seconds:.1f} s")
+        if self.warnings:
+            lines += [f"UNUSUAL  {warning}" for warning in self.warnings]
+        elif self.calibrated:
+            lines.append("         all within what is usual for the weights' own test pairs")
+        else:
+            lines.append("         these weights do not say what is usual")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class TransferResult:
+    """The identity mesh in the pose of the pose mesh.
+
+    Attributes:
+        verts: (V, 3) float32 vertices, in number and order of the identity file.
+        faces: (F, 3) the identity file's faces.
+        report: what was done and how far to trust it.
+        views: vertices and faces of identity, pose and result, upright and to scale, for pictures.
+    """
+
+    verts: Tensor
+    faces: Tensor
+    report: TransferReport
+    views: tuple[tuple[Tensor, Tensor], ...]
+
+
+def _indented(text: str) -> str:
+    return "\n".join(f"  {line}" for line in text.splitlines())

@@ -1,0 +1,218 @@
+"""Many poses for one identity: where they come from, and the transfer of each in order."""
+
+import os
+import re
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from meshkit.io import MeshFileError, SurfaceBinding
+from meshkit.transfer._choose import Weights
+from meshkit.transfer._frames import find_rotation, turns_about
+from meshkit.transfer._kinds import rest_body
+from meshkit.transfer._prepare import Mesh, Prepared, named, read
+from meshkit.transfer.report import TransferResult
+from meshkit.transfer.transfer import PoseTransfer
+
+__all__ = ["is_sequence", "read_sequence", "transfer_sequence"]
+
+_FORMATS = {".obj", ".ply", ".off", ".stl", ".glb"}
+
+
+def is_sequence(path: str | os.PathLike[str]) -> bool:
+    """Whether a path holds many poses: a folder, an ``.npz`` file, or a ``.glb`` of several meshes with equal faces.
+
+    Raises:
+        MeshFileError: a ``.glb`` that cannot be read.
+    """
+    path = Path(path)
+    if path.is_dir() or path.suffix.lower() == ".npz":
+        return True
+    return path.suffix.lower() == ".glb" and path.is_file() and len(_glb_meshes(path)) > 1
+
+
+def read_sequence(path: str | os.PathLike[str]) -> list[Mesh]:
+    """The pose meshes of a folder, an ``.npz`` or a ``.glb`` file, in order.
+
+    A folder: its mesh files, sorted by name with numbers by value (``pose9`` before ``pose10``). An ``.npz`` file:
+    arrays ``verts`` (T, V, 3) and ``faces`` (F, 3). A ``.glb`` file: its meshes, sorted likewise by the names of their
+    nodes.
+
+    Raises:
+        MeshFileError: there is nothing there, or not what is described here.
+    """
+    path = Path(path)
+    if path.is_dir():
+        listed = [file for file in path.iterdir() if file.suffix.lower() in _FORMATS and not file.name.startswith(".")]
+        if not listed:
+            raise MeshFileError(f"{path}: no mesh files in this folder ({', '.join(sorted(_FORMATS))})")
+        listed.sort(key=lambda file: _natural(file.name))
+        return list(listed)
+    if not path.is_file():
+        raise MeshFileError(f"{path}: no such file or folder")
+    if path.suffix.lower() == ".npz":
+        return list(_npz_meshes(path))
+    if path.suffix.lower() == ".glb":
+        meshes = _glb_meshes(path)
+        if meshes:
+            return list(meshes)
+    raise MeshFileError(f"{path}: poses come as a folder of meshes, an .npz file or a .glb file of several meshes")
+
+
+def _natural(name: str) -> list[Any]:
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name)]
+
+
+def _npz_meshes(path: Path) -> list[tuple[Tensor, Tensor]]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in ("verts", "faces")}
+    except Exception as error:  # zipfile, zlib, KeyError and ValueError, depending on the damage
+        raise MeshFileError(f"{path}: not an .npz file with arrays verts and faces ({error})") from error
+    verts, faces = arrays["verts"], arrays["faces"]
+    good = verts.ndim == 3 and verts.shape[0] > 0 and verts.shape[2] == 3 and verts.dtype.kind == "f"
+    if not (good and faces.ndim == 2 and faces.shape[1] == 3 and faces.dtype.kind in "iu"):
+        raise MeshFileError(
+            f"{path}: expected floating verts (T, V, 3) and integer faces (F, 3), got {verts.dtype} {verts.shape} and "
+            f"{faces.dtype} {faces.shape}"
+        )
+    triangles = torch.from_numpy(faces.astype(np.int64))
+    return [(torch.from_numpy(frame.astype(np.float32)), triangles) for frame in verts]
+
+
+def _glb_meshes(path: Path) -> list[tuple[Tensor, Tensor]]:
+    """The meshes of a scene by the names of their nodes, if all have equal faces; else none."""
+    import trimesh
+
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        nodes = sorted(scene.graph.nodes_geometry, key=_natural)
+        placed = [(scene.geometry[geometry], place) for place, geometry in map(scene.graph.get, nodes)]
+        parts = [part.copy().apply_transform(place) for part, place in placed if isinstance(part, trimesh.Trimesh)]
+    except Exception as error:  # trimesh raises what its readers raise
+        raise MeshFileError(f"{path}: not a readable GLB file ({error})") from error
+    if not parts or any(not np.array_equal(part.faces, parts[0].faces) for part in parts):
+        return []
+    faces = torch.from_numpy(np.asarray(parts[0].faces, dtype=np.int64))
+    return [(torch.from_numpy(np.asarray(part.vertices, dtype=np.float32)), faces) for part in parts]
+
+
+def transfer_sequence(
+    identity: Mesh,
+    poses: str | os.PathLike[str] | Iterable[Mesh],
+    *,
+    weights: Weights = "auto",
+    refine: bool | float = True,
+    frame: Literal["pose", "identity"] = "pose",
+    identity_up: str | None = None,
+    identity_facing: str | None = None,
+    identity_unit: str | None = None,
+    pose_up: str | None = None,
+    pose_facing: str | None = None,
+    pose_unit: str | None = None,
+    device: torch.device | str | None = None,
+) -> Iterator[TransferResult]:
+    """Give one identity many poses, one after the other and in their order.
+
+    Work on the identity mesh is done once. Where the pose meshes share their faces, so is the cleaning and simplifying
+    of the first one, and the others' vertices follow it; then also unit and size are those of the first. The
+    orientation of each is sought among the previous one's and the quarter turns next to it, so that a body may turn
+    around during a sequence. Every pose is transferred by itself: nothing is smoothed over time.
+
+    Args:
+        identity: the mesh that gives the body; see :func:`transfer_pose`.
+        poses: a folder, an ``.npz`` or a ``.glb`` file (see :func:`read_sequence`), or meshes.
+        weights: see :class:`PoseTransfer`, as all that follows.
+        refine: keep the identity's local shape.
+        frame: ``"pose"`` or ``"identity"``.
+        identity_up: of the identity file; found if ``None``.
+        identity_facing: likewise.
+        identity_unit: likewise.
+        pose_up: of the first pose; found if ``None``.
+        pose_facing: likewise.
+        pose_unit: likewise.
+        device: where to compute.
+
+    Yields:
+        A :class:`TransferResult` for each pose.
+
+    Raises:
+        MeshFileError: a file is missing, damaged or no mesh.
+        ValueError: unknown weights or options, or a mesh that cannot be used.
+
+    Example:
+        >>> from meshkit.data import load_humans
+        >>> from meshkit.models import pretrained_names
+        >>> body = load_humans()
+        >>> moves = [(v, body.faces) for v in body(torch.tensor([5, 5]), torch.tensor([10, 11]))]
+        >>> if "xdualnet-humans" in pretrained_names():
+        ...     results = list(transfer_sequence((body.template, body.faces), moves, weights="xdualnet-humans"))
+        ...     assert len(results) == 2
+    """
+    meshes = read_sequence(poses) if isinstance(poses, str | os.PathLike) else poses
+    transfer = PoseTransfer(
+        identity,
+        weights=weights,
+        refine=refine,
+        frame=frame,
+        identity_up=identity_up,
+        identity_facing=identity_facing,
+        identity_unit=identity_unit,
+        device=device,
+    )
+    first: Prepared | None = None
+    before: Prepared | None = None
+    follower: _Follower | None = None
+    for number, mesh in enumerate(meshes):
+        start = time.perf_counter()
+        name, verts, faces, _ = read(mesh, f"pose {number}")
+        if follower is not None and before is not None and follower.fits(verts, faces):
+            current = follower.follow(transfer, name, verts, before)
+        else:
+            current = transfer.prepare_pose((verts, faces), name, unit=pose_unit, up=pose_up, facing=pose_facing)
+            follower = _Follower(current, verts)
+        first = first or current
+        before = current
+        with torch.no_grad():
+            yield transfer.apply(current, start, up=first.up)
+
+
+class _Follower:
+    """Later poses of the mesh that was prepared first: the same cleaning and the same simple vertices."""
+
+    def __init__(self, first: Prepared, verts: Tensor) -> None:
+        self._first, self._num_verts = first, len(verts)
+        clean, simple = first.clean, first.simple
+        self._binding = SurfaceBinding(simple.verts, simple.faces, clean.verts, clean.faces)
+
+    def fits(self, verts: Tensor, faces: Tensor) -> bool:
+        return len(verts) == self._num_verts and torch.equal(faces.cpu(), self._first.faces.cpu())
+
+    def follow(self, transfer: PoseTransfer, name: str, verts: Tensor, before: Prepared) -> Prepared:
+        first = self._first
+        if not bool(torch.isfinite(verts).all()):
+            raise ValueError(f"{name}: vertices are NaN or infinite")
+        scaled = (verts * first.scale.factor).to(first.clean.verts)
+        clean = replace(first.clean, verts=scaled[first.clean.source.to(scaled.device)], original=scaled)
+        small = clean.verts if first.simple.method == "none" else self._binding.carry(clean.verts)
+        simple = replace(first.simple, verts=small, original=clean.verts)
+        rotation = before.rotation
+        if transfer.kind is not None:
+            rotation, _ = named(
+                name,
+                lambda: find_rotation(
+                    transfer.net,
+                    small,
+                    simple.faces,
+                    reference=rest_body(transfer.kind or ""),
+                    candidates=turns_about(before.rotation),
+                    usual=before.rotation[None],
+                ),
+            )
+        return replace(first, name=name, clean=clean, simple=simple, rotation=rotation.to(small))

@@ -1,0 +1,542 @@
+"""Pose transfer between any two meshes: the way into the weights' frame and back, honesty, sequences, the command.
+
+``Copy`` stands for weights where the way there and back is tested: its result is the identity mesh, so that the whole
+transfer must be a rigid motion of the identity mesh into the frame and place of the pose mesh.
+"""
+
+import itertools
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from conftest import assert_near
+from torch import Tensor, nn
+
+import meshkit.transfer._choose as choose
+from meshkit.batching import center
+from meshkit.data import load_animals, load_humans, load_shipped
+from meshkit.io import MeshFileError, load_mesh, save_mesh
+from meshkit.metrics import pmd
+from meshkit.models import GeneratorConfig, GeneratorOutput, PretrainedTransfer, pretrained_names
+from meshkit.ot import sinkhorn
+from meshkit.transfer import (
+    Confidence,
+    PoseTransfer,
+    read_sequence,
+    save_picture,
+    transfer_pose,
+    transfer_sequence,
+    usual_range,
+)
+from meshkit.transfer._frames import axis_name, axis_vector, find_scale, rotations, turn_up, turns_about
+from meshkit.transfer._kinds import guess_kind
+from meshkit.transfer.command import main
+from meshkit.transfer.confidence import row_entropies
+
+UPRIGHT = {"identity_up": "+z", "identity_facing": "-y", "pose_up": "+z", "pose_facing": "-y"}
+Mesh = tuple[Tensor, Tensor]
+WEIGHTS = "corenet3d-humans"
+BOUND = 1.5  # of PMD, in 1e-3 m²
+
+
+class Copy(nn.Module):
+    """A generator that leaves the identity as it is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.ones(()))
+
+    def forward(self, identity, pose, **_):
+        plan = sinkhorn(identity[:, :, :], pose[:, :, :])
+        return GeneratorOutput(identity * self.scale, identity, plan)
+
+
+def copier(**card) -> PretrainedTransfer:
+    return PretrainedTransfer(Copy(), GeneratorConfig(k=1), card={"name": "copy", **card}).eval()  # type: ignore[arg-type]
+
+
+def body_of(resolution: int, identity: int, pose: int) -> Mesh:
+    body = load_humans(resolution)
+    return body(torch.tensor([identity]), torch.tensor([pose]))[0], body.faces
+
+
+@pytest.fixture(scope="module")
+def person() -> Mesh:
+    return body_of(1000, 3, 10)
+
+
+@pytest.fixture(scope="module")
+def mover() -> Mesh:
+    verts, faces = body_of(2000, 50, 500)
+    return verts + torch.tensor([2.0, 1.0, 0.5]), faces
+
+
+def y_up(verts: Tensor) -> Tensor:
+    return torch.stack([verts[:, 0], verts[:, 2], -verts[:, 1]], 1)
+
+
+def standing_point(verts: Tensor) -> Tensor:
+    low, high = verts.amin(0), verts.amax(0)
+    return torch.stack([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
+
+
+# Axes and units
+
+
+def test_rotations_are_those_of_the_cube():
+    found = rotations()
+    assert len(found) == 24
+    assert torch.equal(found[0], torch.eye(3))
+    assert_near(found @ found.mT, torch.eye(3).expand(24, 3, 3), 1e-6)
+    assert bool((torch.linalg.det(found) > 0).all())
+    assert len({tuple(matrix.flatten().tolist()) for matrix in found}) == 24
+    for up, facing in itertools.permutations(["+x", "-y", "+z"], 2):
+        (matrix,) = rotations(up, facing)
+        assert torch.equal(matrix @ axis_vector(up), torch.tensor([0.0, 0, 1]))
+        assert torch.equal(matrix @ axis_vector(facing), torch.tensor([0.0, -1, 0]))
+    assert len(rotations("+y")) == len(rotations(facing="-x")) == 4
+
+
+def test_turning_up_is_the_least_rotation():
+    axes = [axis_vector(sign + letter) for sign in "+-" for letter in "xyz"]
+    for source, target in itertools.product(axes, axes):
+        matrix = turn_up(source, target)
+        assert torch.equal(matrix @ source, target)
+        assert torch.linalg.det(matrix) == 1
+        angle = math.acos((float(matrix.trace()) - 1) / 2)
+        assert angle == pytest.approx(math.acos(float(source @ target)))
+
+
+def test_quarter_turns_are_seven():
+    start = rotations("+y", "+z")[0]
+    near = turns_about(start)
+    assert torch.equal(near[0], start) and len(near) == 7
+    assert all(float((near[0].T @ turned).trace()) == pytest.approx(1) for turned in near[1:])
+
+
+@pytest.mark.parametrize("unit", ["m", "cm", "mm", "in", "ft"])
+def test_units_are_guessed_from_the_area(unit):
+    metres = {"m": 1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}[unit]
+    scale = find_scale(1.9 / metres**2, 1.8, None)
+    assert (scale.unit, scale.fit) == (unit, 1.0)
+    assert scale.factor == pytest.approx(metres)
+
+
+def test_odd_sizes_are_scaled_to_the_reference():
+    giant = find_scale(1.8 * 4, 1.8, "m")  # twice as tall
+    assert giant.fit == pytest.approx(0.5)
+    assert "scaled by 0.5" in str(giant)
+    assert find_scale(1.8 * 1.2**2, 1.8, "m").fit == 1.0
+    assert find_scale(1.8 * 7**2, 1.8, None).fit == pytest.approx(1 / (7 * 0.3048))  # nearest as 7 feet
+
+
+def test_impossible_axes_and_units_are_refused():
+    with pytest.raises(ValueError, match="an axis is"):
+        axis_vector("up")
+    with pytest.raises(ValueError, match="right angles"):
+        rotations("+z", "-z")
+    with pytest.raises(ValueError, match="unit must be one of m, cm"):
+        find_scale(1.0, 1.0, "inch")
+    with pytest.raises(ValueError, match="no surface area"):
+        find_scale(0.0, 1.0, None)
+
+
+# There and back
+
+
+def test_the_result_stands_where_the_pose_mesh_stands(person, mover):
+    result = transfer_pose(person, mover, weights=copier(), **UPRIGHT)
+    expected = person[0] - standing_point(person[0]) + standing_point(mover[0])
+    assert_near(result.verts, expected, 1e-4)
+    assert torch.equal(result.faces, person[1])
+
+
+@pytest.mark.parametrize("frame", ["pose", "identity"])
+def test_axes_and_units_there_and_back(person, mover, frame):
+    """Identity in centimetres and y up, pose in metres and z up."""
+    theirs = (100 * y_up(person[0]), person[1])
+    axes = UPRIGHT | {"identity_up": "+y", "identity_facing": "+z"}
+    result = transfer_pose(theirs, mover, weights=copier(), frame=frame, **axes)
+    expected = person[0] - standing_point(person[0]) + standing_point(mover[0])
+    assert_near(result.verts, expected if frame == "pose" else 100 * y_up(expected), 1e-4)
+    assert (result.report.identity.scale.unit, result.report.pose.scale.unit) == ("cm", "m")
+
+
+def test_a_body_of_odd_size_keeps_it(person, mover):
+    result = transfer_pose((3 * person[0], person[1]), mover, weights=copier(), identity_unit="m", **UPRIGHT)
+    assert result.report.identity.scale.fit < 0.5
+    expected = 3 * (person[0] - standing_point(person[0])) + standing_point(mover[0])
+    assert_near(result.verts, expected, 1e-4)
+
+
+def test_loose_parts_and_unused_vertices_follow(person, mover):
+    """An eye inside the head, a vertex of no face, a repeated vertex: all are in the result, moved along."""
+    eye = trimesh.creation.icosphere(1, radius=0.02)
+    verts, faces = person
+    head = verts[verts[:, 2].argmax()] - torch.tensor([0.0, 0, 0.1])
+    more = torch.cat([verts, torch.tensor(eye.vertices).float() + head, verts[:1], verts[1:2]])
+    more_faces = torch.cat([faces, torch.tensor(eye.faces).long() + len(verts)])
+    more_faces[0][more_faces[0] == faces[0, 0]] = faces[0, 0]
+    result = transfer_pose((more, more_faces), mover, weights=copier(), **UPRIGHT)
+    expected = more - standing_point(verts) + standing_point(mover[0])
+    assert_near(result.verts, expected, 1e-3)
+    assert any("smaller parts removed" in note for note in result.report.identity.notes)
+
+
+def test_many_vertices_are_simplified_and_carried_back(mover):
+    fine = body_of(6890, 3, 10)
+    result = transfer_pose(fine, mover, weights=copier(), refine=False, **UPRIGHT)
+    assert len(result.report.identity.simple.verts) == 1000
+    assert_near(result.verts, fine[0] - standing_point(fine[0]) + standing_point(mover[0]), 1e-3)
+
+
+def test_refining_keeps_the_identitys_lengths(person, mover):
+    """A network that makes everything a tenth too large: refined towards it, edges are nearer to their lengths."""
+    net = copier()
+    nn.init.constant_(net.generator.scale, 1.1)
+    changes = []
+    for refine in (False, 0.1, 10.0):
+        verts = transfer_pose(person, mover, weights=net, refine=refine, **UPRIGHT).verts
+        edges = [(v[person[1][:, 0]] - v[person[1][:, 1]]).norm(dim=1) for v in (verts, person[0])]
+        changes.append(float((edges[0] / edges[1]).mean()) - 1)
+    assert changes[0] == pytest.approx(0.1, abs=1e-3)
+    assert 0 < changes[1] < changes[2] < changes[0]
+
+
+# Honesty
+
+
+def test_row_entropies_are_those_of_the_distributions():
+    plan = torch.tensor([[0.25, 0.25, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.0], [0.1, 0.1, 0.1]])
+    assert_near(row_entropies(plan), torch.tensor([math.log(2), 0.0, 0.0, math.log(3)]), 1e-6)
+
+
+def test_unusual_numbers_are_put_into_words():
+    ordinary = [Confidence(0.01 * i, 0.5, 0.1, 0.2, None) for i in range(101)]
+    usual = usual_range(ordinary)
+    assert usual["match_spread"] == {"median": 0.5, "limit": 0.99}
+    assert "pose_distance" not in usual
+    assert Confidence(0.5, 0.5, 0.1, 0.2, 9.0).warnings(usual) == ()
+    assert Confidence(None, None, 0.1, None, None).warnings(usual) == ()
+    (text,) = Confidence(0.5, 0.1, 0.1, 0.2, None).warnings(usual)
+    assert text == "few vertices match both ways: 10%, usually 50%"
+    assert len(Confidence(2.0, 0.1, 0.9, 0.9, None).warnings(usual)) == 4
+    with pytest.raises(ValueError, match="needs measured pairs"):
+        usual_range([])
+
+
+def test_the_report_says_what_was_done(person, mover):
+    result = transfer_pose(
+        person, mover, weights=copier(usual={"edge_change": {"median": 0.0, "limit": -1.0}}), **UPRIGHT
+    )
+    text = str(result.report)
+    assert "simplified to 1000 vertices" in text and "frame    up +z, facing -y (given)" in text
+    assert "UNUSUAL  edges change their length by 0% on average" in text
+    assert result.report.confidence.edge_change == pytest.approx(0, abs=1e-5)
+    assert result.report.confidence.identity_distance is None
+    assert "do not say what is usual" in str(transfer_pose(person, mover, weights=copier(), **UPRIGHT).report)
+    wide = copier(usual={"edge_change": {"median": 0.0, "limit": 1.0}})
+    assert "all within what is usual" in str(transfer_pose(person, mover, weights=wide, **UPRIGHT).report)
+
+
+# People and animals
+
+
+def test_people_and_animals_are_told_apart():
+    for kind, poses in (("humans", (0, 400)), ("animals", (0, 200))):
+        body, _ = load_shipped(kind)
+        for pose in poses:
+            verts = body(torch.tensor([5]), torch.tensor([pose]))[0]
+            assert guess_kind(30 * y_up(verts), body.faces)[0] == kind
+
+
+def test_auto_takes_the_best_weights_of_the_kind(person, monkeypatch):
+    cards = {"a": ("humans", 3.0), "b": ("humans", 1.0), "c": ("animals", 0.5)}
+    monkeypatch.setattr(choose, "pretrained_names", lambda: sorted(cards))
+    monkeypatch.setattr(
+        choose,
+        "load_pretrained",
+        lambda name, **_: copier(name=name, data=cards[name][0], figures={"pmd": cards[name][1]}),
+    )
+    net, why = choose.choose_weights("auto", person)
+    assert net.card["name"] == "b" and "shape is that of humans" in why
+    animals = load_animals()
+    net, why = choose.choose_weights("auto", (animals.template, animals.faces))
+    assert net.card["name"] == "c"
+    del cards["c"]
+    with pytest.raises(ValueError, match="no weights for animals"):
+        choose.choose_weights("auto", (animals.template, animals.faces))
+
+
+def test_a_runs_folder_gives_weights(tmp_path):
+    from safetensors.torch import save_file
+
+    config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(16, 8))
+    save_file(config.build().state_dict(), tmp_path / "model.safetensors")
+    (tmp_path / "model.json").write_text('{"extractor_widths": [8, 16], "k": 4, "widths": [16, 8]}')
+    assert choose.choose_weights(tmp_path, "unread")[0].card == {}
+    for text, facts in (
+        ('{"data": "humans", "vertices": 2000}', {"data": "humans", "vertices": 2000, "name": tmp_path.name}),
+        ('{"data": "animals", "vertices": null}', {"data": "animals", "name": tmp_path.name}),
+        ('{"data": "my own"}', {}),
+        ("{", {}),
+    ):
+        (tmp_path / "config.json").write_text(text)
+        assert choose.choose_weights(str(tmp_path), "unread")[0].card == facts
+
+
+# Bad input
+
+
+def test_unusable_meshes_and_options_are_refused(person, mover, tmp_path, monkeypatch):
+    net = copier()
+    with pytest.raises(ValueError, match="weights must be 'auto', the folder of a run, or one of"):
+        transfer_pose(person, mover, weights="nothing")
+    with pytest.raises(ValueError, match="frame must be"):
+        PoseTransfer(person, weights=net, frame="world")
+    with pytest.raises(ValueError, match="refine must be"):
+        PoseTransfer(person, weights=net, refine=-1.0)
+    with pytest.raises(ValueError, match="refine must be"):
+        PoseTransfer(person, weights=net, refine=math.nan)
+    with pytest.raises(ValueError, match="device cuda:99 cannot be used"):
+        PoseTransfer(person, weights=net, device="cuda:99")
+    with pytest.raises(ValueError, match=r"identity must be a path or a tuple \(verts, faces\)"):
+        PoseTransfer(person[0], weights=net)
+    with pytest.raises(MeshFileError, match="no such file"):
+        PoseTransfer(tmp_path / "none.obj", weights=net)
+    (tmp_path / "bad.obj").write_text("v 0 0 zero\n")
+    with pytest.raises(MeshFileError, match=r"bad\.obj"):
+        PoseTransfer(tmp_path / "bad.obj", weights=net)
+    square = (torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    with pytest.raises(ValueError, match="pose: 4 vertices in its largest part; a body needs 64"):
+        transfer_pose(person, square, weights=net, **UPRIGHT)
+    nan = person[0].clone()
+    nan[5] = math.nan
+    with pytest.raises(ValueError, match="identity: 1 of 1000 vertices have NaN"):
+        PoseTransfer((nan, person[1]), weights=net)
+    with pytest.raises(ValueError, match="pose: up and facing are not clear"):
+        transfer_pose(person, mover, weights=net, identity_up="+z", identity_facing="-y")
+    with pytest.raises(ValueError, match="these weights have no matching"):
+        PoseTransfer(person, weights=copier(data="humans"))
+    nn.init.constant_(net.generator.scale, math.inf)
+    with pytest.raises(ValueError, match="the network's result is not finite"):
+        transfer_pose(person, mover, weights=net, **UPRIGHT)
+
+
+# Sequences
+
+
+@pytest.fixture(scope="module")
+def moves() -> tuple[Tensor, Tensor]:
+    body = load_humans(2000)
+    return body(torch.tensor([50, 50, 50]), torch.tensor([500, 501, 502])), body.faces
+
+
+def test_sequences_are_read_in_order(moves, tmp_path):
+    verts, faces = moves
+    np.savez(tmp_path / "m.npz", verts=verts.numpy(), faces=faces.numpy())
+    folder = tmp_path / "poses"
+    for number, frame in zip((2, 10, 100), verts, strict=True):
+        save_mesh(folder / f"pose{number}.obj", frame, faces)
+    (folder / "notes.txt").write_text("not a mesh")
+    scene = trimesh.Scene()
+    for number, frame in enumerate(verts):
+        scene.add_geometry(trimesh.Trimesh(frame.numpy(), faces.numpy(), process=False), node_name=f"frame{number}")
+    scene.export(tmp_path / "m.glb")
+    for source in (tmp_path / "m.npz", folder, tmp_path / "m.glb"):
+        read = [mesh if isinstance(mesh, tuple) else load_mesh(mesh) for mesh in read_sequence(source)]
+        assert torch.equal(torch.stack([v for v, _ in read]), verts), source
+        assert all(torch.equal(f, faces) for _, f in read)
+
+
+def test_bad_sequences_are_refused(moves, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MeshFileError, match="no mesh files in this folder"):
+        read_sequence(tmp_path / "empty")
+    with pytest.raises(MeshFileError, match="no such file or folder"):
+        read_sequence(tmp_path / "none.npz")
+    (tmp_path / "x.obj").write_text("")
+    with pytest.raises(MeshFileError, match="poses come as a folder"):
+        read_sequence(tmp_path / "x.obj")
+    (tmp_path / "bad.npz").write_bytes(b"PK nothing")
+    (tmp_path / "bad.glb").write_bytes(b"glTF nothing")
+    np.savez(tmp_path / "flat.npz", verts=moves[0][0].numpy(), faces=moves[1].numpy())
+    with pytest.raises(MeshFileError, match=r"not an \.npz file with arrays verts and faces"):
+        read_sequence(tmp_path / "bad.npz")
+    with pytest.raises(MeshFileError, match="not a readable GLB file"):
+        read_sequence(tmp_path / "bad.glb")
+    with pytest.raises(MeshFileError, match=r"expected floating verts \(T, V, 3\)"):
+        read_sequence(tmp_path / "flat.npz")
+
+
+def test_a_sequence_is_as_its_poses_one_by_one(person, moves):
+    verts, faces = moves
+    poses = [(v + torch.tensor([0.0, 0, float(t)]), faces) for t, v in enumerate(verts)]
+    results = list(transfer_sequence(person, poses, weights=copier(), **UPRIGHT))
+    assert len(results) == 3
+    for result, (pose, _) in zip(results, poses, strict=True):
+        expected = person[0] - standing_point(person[0]) + standing_point(pose)
+        assert_near(result.verts, expected, 1e-4)
+    # Later poses keep the first one's simplification: the simple vertices lie on their surface.
+    simple = results[2].report.pose.simple
+    assert len(simple.verts) == 1000
+    assert float(torch.cdist(simple.verts, poses[2][0]).amin(1).max()) < 0.05
+
+
+def test_a_broken_pose_in_a_sequence_is_named(person, moves):
+    verts = moves[0].clone()
+    verts[1, 7] = math.nan
+    poses = [(v, moves[1]) for v in verts]
+    with pytest.raises(ValueError, match="pose 1: vertices are NaN or infinite"):
+        list(transfer_sequence(person, poses, weights=copier(), **UPRIGHT))
+
+
+# Command
+
+
+def command(*words: object) -> None:
+    main([str(word) for word in words])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.obj", "id.obj"], "none.obj: no such file"),
+        (["id.obj", "id.obj", "-o", "x.txt"], "the result is written as .obj"),
+        (["id.obj", "id.obj", "-o", "x.npz"], "the result is written as .obj"),
+        (["id.obj", "id.obj", "-o", "id.obj"], "would overwrite an input"),
+        (["id.obj", "id.obj", "--weights", "none"], "weights must be 'auto'"),
+        (["bad.obj", "id.obj"], "bad.obj: not a readable OBJ mesh"),
+    ],
+)
+def test_mistakes_are_one_line_and_status_2(words, message, person, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_mesh("id.obj", *person)
+    Path("bad.obj").write_text("f 1 2\n")
+    with pytest.raises(SystemExit) as caught:
+        command(*words)
+    assert caught.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+
+
+def test_the_command_writes_mesh_picture_and_page(person, mover, tmp_path, monkeypatch, capsys):
+    from PIL import Image
+
+    monkeypatch.setattr(choose, "_load", lambda *_: copier(data=None))
+    save_mesh(tmp_path / "id.ply", *person)
+    save_mesh(tmp_path / "pose.obj", *mover)
+    axes = ["--identity-up=+z", "--identity-facing=-y", "--pose-up=+z", "--pose-facing=-y", "--weights", "copy"]
+    command(tmp_path / "id.ply", tmp_path / "pose.obj", "-o", tmp_path / "r" / "out.obj", *axes)
+    verts, faces = load_mesh(tmp_path / "r" / "out.obj")
+    assert_near(verts, person[0] - standing_point(person[0]) + standing_point(mover[0]), 1e-4)
+    assert torch.equal(faces, person[1])
+    assert "result" in (tmp_path / "r" / "out.html").read_text()
+    assert Image.open(tmp_path / "r" / "out.png").width > 1200
+    assert "out.obj: 1000 vertices" in capsys.readouterr().out
+
+
+def test_the_command_takes_sequences(person, moves, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(choose, "_load", lambda *_: copier(data=None))
+    save_mesh(tmp_path / "id.obj", *person)
+    np.savez(tmp_path / "moves.npz", verts=moves[0].numpy(), faces=moves[1].numpy())
+    axes = ["--identity-up=+z", "--identity-facing=-y", "--pose-up=+z", "--pose-facing=-y", "--weights", "copy"]
+    quick = [*axes, "--no-picture", "--no-html", "--quiet"]
+    command(tmp_path / "id.obj", tmp_path / "moves.npz", "-o", tmp_path / "out.npz", *quick)
+    command(tmp_path / "id.obj", tmp_path / "moves.npz", "-o", tmp_path / "out.obj", *quick)
+    with np.load(tmp_path / "out.npz") as archive:
+        written = torch.from_numpy(archive["verts"])
+        assert np.array_equal(archive["faces"], person[1].numpy())
+    for number in range(3):
+        assert torch.equal(load_mesh(tmp_path / f"out_{number:04d}.obj")[0], written[number])
+    assert capsys.readouterr().out == ""
+
+
+def test_no_results_are_no_picture(tmp_path):
+    with pytest.raises(ValueError, match="no results to draw"):
+        save_picture(tmp_path / "x.png", [])
+
+
+def test_the_recipe_is_the_command(monkeypatch, capsys):
+    recipe = Path(__file__).parents[1] / "recipes" / "transfer.py"
+    monkeypatch.setattr(sys, "argv", ["transfer.py", "--help"])
+    with pytest.raises(SystemExit) as caught:
+        exec(compile(recipe.read_text(), recipe, "exec"), {"__name__": "__main__"})
+    assert caught.value.code == 0 and "--pose-facing" in capsys.readouterr().out
+
+
+# The shipped weights on meshes of other origin
+
+
+def with_hole(mesh: Mesh) -> Mesh:
+    """Cut a hole of 8 cm into the back."""
+    verts, faces = mesh
+    near = (verts - verts[verts[:, 1].argmax()]).norm(dim=1) < 0.08
+    return verts, faces[~near[faces].any(1)]
+
+
+def with_eye(mesh: Mesh) -> Mesh:
+    """Add a ball inside the head, at the end of the vertices."""
+    eye = trimesh.creation.icosphere(1, radius=0.02)
+    place = mesh[0][mesh[0][:, 2].argmax()] - torch.tensor([0.0, 0, 0.1])
+    return torch.cat([mesh[0], torch.tensor(eye.vertices).float() + place]), torch.cat(
+        [mesh[1], torch.tensor(eye.faces).long() + len(mesh[0])]
+    )
+
+
+CASES = {
+    "3445 vertices": lambda mesh: mesh,
+    "y up, centimetres": lambda mesh: (100 * y_up(mesh[0]), mesh[1]),
+    "turned by 90 degrees": lambda mesh: (mesh[0][:, [1, 0, 2]] * torch.tensor([-1.0, 1, 1]), mesh[1]),
+    "a hole": with_hole,
+    "an eye": with_eye,
+}
+
+
+@pytest.fixture(scope="module")
+def fine_transfer():
+    """An unseen person of 6890 vertices, ready to take poses with the shipped weights."""
+    split = load_shipped("humans")[1]
+    a, p, b, q = split.test_pairs[2].tolist()
+    transfer = PoseTransfer(body_of(6890, a, p), weights=WEIGHTS)
+    return transfer, body_of(3445, b, q), body_of(6890, a, q)[0]
+
+
+@pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
+@pytest.mark.parametrize("case", CASES)
+def test_pose_meshes_of_any_origin(case, fine_transfer):
+    """The result is near the truth, in the axes and the unit of the pose mesh; a wrong guess of the axes is in doubt."""
+    transfer, pose, truth = fine_transfer
+    change = CASES[case]
+    result = transfer(change(pose))
+    if case == "turned by 90 degrees" and axis_name(-result.report.pose.rotation[1]) != "+x":
+        assert "in doubt" in str(result.report)
+        result = transfer(change(pose), pose_facing="+x")
+    posed, expected = result.verts, change((truth, transfer.identity.faces))[0][: len(truth)]
+    metre = result.report.pose.scale.metres
+    assert metre == (0.01 if case == "y up, centimetres" else 1.0)
+    assert 1e3 * float(pmd(metre * posed[None], center(metre * expected[None]))[0]) < BOUND
+
+
+@pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
+def test_strangers_are_reported(fine_transfer):
+    transfer, pose, _ = fine_transfer
+    assert transfer(pose).report.warnings == ()
+    animals = load_animals()
+    ball = trimesh.creation.icosphere(4)
+    strangers = [(animals.template, animals.faces), (torch.tensor(ball.vertices).float(), torch.tensor(ball.faces))]
+    for stranger in strangers:
+        assert transfer(stranger).report.warnings
+
+
+@pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
+def test_the_page_runs(capsys):
+    page = Path(__file__).parents[1] / "docs" / "transfer.md"
+    (block,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    exec(compile(block, page.name, "exec"), {})
+    assert "unit cm (guessed from the surface area)" in capsys.readouterr().out

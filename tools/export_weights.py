@@ -1,0 +1,246 @@
+"""Turn a finished run into weights that ship with meshkit, with their model card.
+
+    python tools/export_weights.py runs/xdualnet-small xdualnet-humans
+
+Writes meshkit/weights/NAME.safetensors (the residual blocks as float16, the rest as float32), NAME.json and NAME.md,
+after checking that the network with rounded parameters gives the run's vertices within a thousandth of a metre, and
+measuring what is usual on test pairs for the transfer's honesty report.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+
+from meshkit.data import load_humans, load_shipped
+from meshkit.io import atomic_write, simplify
+from meshkit.models import PretrainedTransfer, load_generator
+from meshkit.transfer import measure_confidence, usual_range
+
+ROOT = Path(__file__).parents[1]
+WEIGHTS = ROOT / "meshkit" / "weights"
+TOLERANCE = 1e-3  # metres
+MATCHING = ("extractor.", "theta.", "phi.")
+IGNORED = {"preset", "out", "name", "resume", "apply", "result", "threads", "accelerator", "data", "seed", "workers"}
+LICENCES = {
+    "humans": {
+        "id": "Apache-2.0",
+        "note": "Trained on the shipped human bodies (CC0 1.0, distilled from the MakeHuman data).",
+    },
+    "animals": {
+        "id": "CC-BY-SA-3.0",
+        "note": "Trained on the shipped animals, which are made from art of 0 A.D. by Wildfire Games "
+        "(https://wildfiregames.com), CC BY-SA 3.0 (https://creativecommons.org/licenses/by-sa/3.0/). The weights "
+        "carry the same licence: credit Wildfire Games, and share what is made from the weights alike.",
+    },
+}
+
+
+def rounded(state: dict[str, torch.Tensor], parameters: set[str]) -> dict[str, torch.Tensor]:
+    """Parameters as float16, all but those that the matching rests on: it decides sharply, and they are few.
+
+    Buffers are few as well, and some are too small for float16.
+    """
+    short = {key for key in parameters if not key.startswith(MATCHING)}
+    return {key: (value.half() if key in short else value).contiguous() for key, value in state.items()}
+
+
+@torch.no_grad()
+def check(run: PretrainedTransfer, exported: PretrainedTransfer, body: Any, pairs: torch.Tensor) -> float:
+    """Largest distance between vertices of the two networks over some test pairs."""
+    worst = 0.0
+    for a, p, b, q in pairs.tolist():
+        identity, pose = body(torch.tensor([a, b]), torch.tensor([p, q]))
+        sides = {"identity_faces": body.faces, "pose_faces": body.faces}
+        worst = max(worst, float((run(identity, pose, **sides) - exported(identity, pose, **sides)).norm(dim=1).max()))
+    return worst
+
+
+@torch.no_grad()
+def measure_usual(net: PretrainedTransfer, body: Any, pairs: torch.Tensor) -> dict[str, Any]:
+    """What the honesty report compares with, over test pairs.
+
+    Meshes of other origin are simplified to the size of the training meshes and have other triangles. So on every
+    second pair the meshes are made finer and simplified back.
+    """
+    measured = []
+    for number, (a, p, b, q) in enumerate(pairs.tolist()):
+        meshes = []
+        for who, how in ((a, p), (b, q)):
+            verts = body(torch.tensor([who]), torch.tensor([how]))[0]
+            meshes.append(retriangulated(body, who, how) if number % 2 else (verts, body.faces))
+        (identity, identity_faces), (pose, pose_faces) = meshes
+        sides = {"identity_faces": identity_faces, "pose_faces": pose_faces}
+        output = net.output(identity, pose, **sides)
+        measured.append(measure_confidence(net, identity, pose, **sides, output=output))
+    return usual_range(measured)
+
+
+def retriangulated(body: Any, identity: int, pose: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """A posed body with as many vertices as ``body``, but other ones."""
+    import trimesh
+
+    fine = load_humans(6890) if len(body.identities) == len(load_humans().identities) else body
+    verts, faces = fine(torch.tensor([identity]), torch.tensor([pose]))[0], fine.faces
+    if fine is body:
+        points, triangles = trimesh.remesh.subdivide(verts.numpy(), faces.numpy())
+        verts, faces = torch.from_numpy(points).float(), torch.from_numpy(triangles).long()
+    small = simplify(verts, faces, len(body.template))
+    return small.verts, small.faces
+
+
+def command(config: dict[str, Any]) -> str:
+    """The command that repeats the run: its recipe, preset, and what differs from the preset."""
+    sys.path.insert(0, str(ROOT / "recipes"))
+    import corenet3d
+    import xdualnet
+
+    recipe: Any = xdualnet if "lambda_corr" in config else corenet3d
+    words = [f"python recipes/{recipe.__name__}.py --preset {config['preset']} --data {config['data']}"]
+    words.append(f"--seed {config['seed']}")
+    preset = json.loads(json.dumps(asdict(recipe.PRESETS[config["preset"]]), default=str))
+    words += differences(preset, {k: v for k, v in config.items() if k not in IGNORED}, "")
+    return " ".join(words)
+
+
+def differences(preset: dict[str, Any], config: dict[str, Any], prefix: str) -> list[str]:
+    words = []
+    for key, value in config.items():
+        if value == preset.get(key) or (key == "minutes" and config.get("steps") is not None):
+            continue
+        flag = f"{prefix}{key.replace('_', '-')}"
+        if isinstance(value, dict):
+            words += differences(preset[key], value, f"{flag}.")
+        elif isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--{prefix}no-{key.replace('_', '-')}")
+        elif isinstance(value, list):
+            words.append(f"--{flag} {' '.join(map(str, value))}")
+        else:
+            words.append(f"--{flag} {value}")
+    return words
+
+
+def markdown(name: str, card: dict[str, Any]) -> str:
+    figures = card["figures"]
+    rows = "\n".join(f"| {key} | {value} |" for key, value in figures.items())
+    usual = "\n".join(f"| {key} | {v['median']} | {v['limit']} |" for key, v in card["usual"].items())
+    machine = card["machine"]
+    processor = machine["gpu"] or machine["processor"]
+    minutes = card["train_minutes"]
+    return f"""# {name}
+
+{card["system"]}, preset `{card["preset"]}`, trained on the {card["data"]} that ship with meshkit.
+
+```python
+import torch
+from meshkit.models import load_pretrained
+
+net = load_pretrained("{name}")
+posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces)  # (V, 3)
+```
+
+- **Input**: two meshes in metres, z up, facing -y, around {card["vertices"]} vertices each; `meshkit.transfer` brings
+  others there.
+- **Training**: `{card["command"]}`
+  ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor}, {card["precision"]}, torch
+  {machine["torch"]}), finished on {card["date"]}.
+- **Split**: {card["split"]}
+- **Size**: {card["parameters"]:,} parameters, those of the residual blocks stored with 16 bits. Rounding them moves no
+  vertex of {card["rounding"]["pairs"]} test pairs by more than {1e3 * card["rounding"]["largest_distance_m"]:.3f} mm.
+- **Licence**: {card["licence"]["id"]}. {card["licence"]["note"]}
+
+## Figures
+
+Means over the first {card["test_pairs"]} fixed test pairs, by the network as it was trained, not rounded.
+Units: {card["units"]}. `copy_identity` and `copy_warped` are what the unchanged
+identity and the warped mesh would score.
+
+| figure | value |
+|---|---:|
+{rows}
+
+## What is usual
+
+Over the first {card["usual_pairs"]} test pairs, every second one with other triangles than those of training.
+`meshkit.transfer` calls a transfer unusual when a number lies beyond the limit (99 of 100 of these pairs lie within);
+`meshkit.transfer.Confidence` says what the numbers are.
+
+| number | median | limit |
+|---|---:|---:|
+{usual}
+
+## Limits
+
+Bodies, poses and animals unlike the training set; several people in one mesh; clothes and hair that are not one surface
+with the body; limbs that touch. Left and right limbs that look alike are sometimes exchanged.
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    parser.add_argument("name", help="name of the weights, such as xdualnet-humans")
+    parser.add_argument("--out", type=Path, default=WEIGHTS)
+    parser.add_argument("--usual-pairs", type=int, default=100, help="test pairs for the usual range")
+    args = parser.parse_args()
+    try:
+        generator, model = load_generator(args.run)
+        config, summary, machine = (
+            json.loads((args.run / f"{part}.json").read_text()) for part in ("config", "summary", "machine")
+        )
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"error: {args.run} is not a finished run: {error}") from None
+    body, split = load_shipped(config["data"], config["vertices"])
+    state = rounded(generator.state_dict(), {key for key, _ in generator.named_parameters()})
+    exported = model.build()
+    exported.load_state_dict({key: v.float() if v.is_floating_point() else v for key, v in state.items()})
+    net = PretrainedTransfer(exported, model).eval()
+    pairs = split.test_pairs[:4]
+    distance = check(PretrainedTransfer(generator, model).eval(), net, body, pairs)
+    if not distance < TOLERANCE:
+        raise SystemExit(f"error: 16-bit parameters move vertices by {distance:.2e}, more than {TOLERANCE:g} metres")
+    card = {
+        "name": args.name,
+        "system": "X-DualNet (unsupervised)" if "lambda_corr" in config else "3D-CoreNet (supervised)",
+        "preset": config["preset"],
+        "command": command(config),
+        "seed": config["seed"],
+        "data": config["data"],
+        "vertices": len(body.template),
+        "split": f"{len(split.train_identities)} identities and {len(split.train_poses)} poses to train on; tested on "
+        f"{len(split.test_identities)} identities and {len(split.test_poses)} poses not seen in training.",
+        "steps": summary["steps"],
+        "pairs_seen": summary["pairs_seen"],
+        "train_minutes": summary["train_minutes"],
+        "precision": config["precision"],
+        "date": time.strftime("%Y-%m-%d", time.gmtime((args.run / "summary.json").stat().st_mtime)),
+        "figures": summary["test"],
+        "test_pairs": summary["test_pairs"],
+        "units": summary["units"],
+        "parameters": summary["parameters"],
+        "machine": machine,
+        "licence": LICENCES[config["data"]],
+        "rounding": {"largest_distance_m": round(distance, 6), "pairs": len(pairs)},
+        "usual": measure_usual(net, body, split.test_pairs[: args.usual_pairs]),
+        "usual_pairs": min(args.usual_pairs, len(split.test_pairs)),
+        "model": asdict(model),
+    }
+    with atomic_write(args.out / f"{args.name}.safetensors") as path:
+        save_file(state, path)
+    for suffix, text in ((".json", json.dumps(card, indent=2) + "\n"), (".md", markdown(args.name, card))):
+        with atomic_write(args.out / f"{args.name}{suffix}") as path:
+            path.write_text(text, encoding="utf-8")
+    size = (args.out / f"{args.name}.safetensors").stat().st_size / 1e6
+    print(f"{args.name}: {size:.1f} MB, rounding moves vertices by at most {1e3 * distance:.3f} mm")
+
+
+if __name__ == "__main__":
+    main()
