@@ -130,6 +130,8 @@ class PretrainedTransfer(nn.Module):
         if isinstance(self.generator, PoseTransferGenerator):
             sides[f"{name}_descriptors"] = descriptors
             sides[f"{name}_features"] = self.generator.encode(centred, mask=mask, descriptors=descriptors)
+            if name == "identity" and self.generator.symmetry:
+                sides["identity_faces"] = faces
         return sides
 
 
