@@ -56,9 +56,8 @@ def mirror_labels(
 
     Reference:
         Kolmogorov and Zabih, "What energy functions can be minimized via graph cuts?", 2004. Not part of the X-DualNet
-        paper, whose failure on symmetric limbs it mends. Where mixed labels of an edge cost less than equal ones
-        together (about 2 % of the edges of matched bodies), the energy cannot be represented and mixing is taken to
-        cost nothing more.
+        paper, whose failure on symmetric limbs it mends. The energy is no cut's where a tear is mended by different
+        labels: see :func:`least_labels`.
 
     Example:
         >>> verts = torch.tensor([[-1.0, 0, 0], [1, 0, 0], [-1, 0, -1], [1, 0, -1], [0, 1, 0]])
@@ -82,17 +81,14 @@ def mirror_labels(
     rest = (verts[i] - verts[j]).norm(dim=1)
     if len(i) == 0 or not float(rest.mean()) > 0:
         return torch.zeros(num, dtype=torch.bool, device=device)
-    positions, length = (targets, mirrored), rest.mean()
-    same_0, first, second, same_1 = (
-        ((positions[a][i] - positions[b][j]).norm(dim=1) - slack * rest).clamp_min(0) / length
-        for a, b in ((0, 0), (1, 0), (0, 1), (1, 1))
-    )
-    # same_0 + (first - same_0) x_i + (same_1 - first) x_j + (second + first - same_0 - same_1) (1 - x_i) x_j
-    cost_of_1 = torch.zeros(num, dtype=torch.float64).index_add_(0, i, first - same_0).index_add_(0, j, same_1 - first)
-    mixed = (first + second - same_0 - same_1).clamp_min(0)
-    every = torch.arange(num)
-    tails, heads = torch.cat([i, every, partner]), torch.cat([j, partner, every])
-    labels = minimum_cut(tails, heads, torch.cat([mixed, torch.full((2 * num,), tie)]), cost_of_1)
+    positions, length, every = (targets, mirrored), rest.mean(), torch.arange(num)
+    tails, heads = torch.cat([i, every]), torch.cat([j, partner])
+    costs = torch.empty(2, 2, len(tails), dtype=torch.float64)  # of the two labels of each pair
+    for a in (0, 1):
+        for b in (0, 1):
+            stretch = ((positions[a][i] - positions[b][j]).norm(dim=1) - slack * rest).clamp_min(0) / length
+            costs[a, b] = torch.cat([stretch, torch.full((num,), tie * float(a != b), dtype=torch.float64)])
+    labels = least_labels(tails, heads, costs, num)
     none = torch.zeros_like(labels)
     volume, opposite, before, swapped = (
         _volume(torch.where(x[:, None], mirrored, targets), faces) for x in (labels, ~labels, none, ~none)
@@ -100,6 +96,50 @@ def mirror_labels(
     if opposite > volume:
         labels, volume = ~labels, opposite
     return (none if volume < _WHOLE * max(before, swapped) else labels).to(device)
+
+
+def least_labels(tails: Tensor, heads: Tensor, costs: Tensor, num: int) -> Tensor:
+    """Labels ``(N,)`` bool of low ``sum costs[x_tail, x_head, edge]``: those of a spanning tree, bettered by a cut.
+
+    Where a matching is torn, the edge wants its ends to differ, which no cut can express. A maximum spanning tree of
+    what edges gain by equal or by different labels says which ends should differ; relative to its labels all but the
+    weak edges want equal ones.
+    """
+    wish = costs[0, 0] + costs[1, 1] - costs[0, 1] - costs[1, 0]  # positive: to differ
+    start = spanning_labels(tails, heads, wish, num)
+    first, second = start[tails].long(), start[heads].long()
+    edge = torch.arange(len(tails))
+    (same_0, other), (swapped, same_1) = ([costs[first ^ a, second ^ b, edge] for b in (0, 1)] for a in (0, 1))
+    surplus = (same_0 + same_1 - other - swapped).clamp_min(0) / 2
+    other, swapped = other + surplus, swapped + surplus
+    # same_0 + (swapped - same_0) y_i + (same_1 - swapped) y_j + (other + swapped - same_0 - same_1) (1 - y_i) y_j
+    linear = torch.zeros(num, dtype=costs.dtype).index_add_(0, tails, swapped - same_0)
+    linear.index_add_(0, heads, same_1 - swapped)
+    return start ^ minimum_cut(tails, heads, (other + swapped - same_0 - same_1).clamp_min(0), linear)
+
+
+def spanning_labels(tails: Tensor, heads: Tensor, wish: Tensor, num: int) -> Tensor:
+    """Labels ``(N,)`` bool that grant the wishes along a maximum spanning tree; a wish above 0 is to differ."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+
+    proper = tails != heads
+    low, high = torch.minimum(tails, heads)[proper], torch.maximum(tails, heads)[proper]
+    pairs, inverse = torch.unique(low * num + high, return_inverse=True)
+    total = torch.zeros(len(pairs), dtype=wish.dtype).index_add_(0, inverse, wish[proper])
+    strength = total.abs()
+    length = strength.amax() + 1 - strength if len(total) else strength  # positive, the least for the strongest
+    places = (pairs // num).numpy(), (pairs % num).numpy()
+    tree = minimum_spanning_tree(coo_array((length.numpy(), places), shape=(num, num)).tocsr())
+    differ = dict(zip(pairs.tolist(), (total > 0).tolist(), strict=True))
+    labels = [False] * num
+    _, component = connected_components(tree, directed=False)
+    for root in torch.from_numpy(component).unique().tolist():
+        order, before = breadth_first_order(tree, int((component == root).argmax()), directed=False)
+        for vertex in order[1:].tolist():
+            parent = int(before[vertex])
+            labels[vertex] = labels[parent] ^ differ[min(parent, vertex) * num + max(parent, vertex)]
+    return torch.tensor(labels)
 
 
 def minimum_cut(tails: Tensor, heads: Tensor, capacities: Tensor, cost_of_1: Tensor) -> Tensor:
