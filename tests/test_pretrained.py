@@ -156,6 +156,7 @@ def test_export_and_load_again(exporter, finished_run, bodies, tmp_path, monkeyp
     card = loaded.card
     assert card["figures"] == {"pmd": 50.0, "pmd_copy_identity": 58.0}
     assert card["licence"]["id"] == "Apache-2.0"
+    assert len(card["first_pairs_pmd"]) == 8
     assert set(card["usual"]) == {"match_spread", "mutual_share", "edge_change", "identity_distance", "pose_distance"}
     text = (weights / "tiny-humans.md").read_text()
     assert card["command"] in text and "Apache-2.0" in text
@@ -211,19 +212,19 @@ def test_shipped_files_are_complete_and_small():
     assert sum(file.stat().st_size for file in folder.iterdir()) <= 15e6
 
 
-# PMD in 1e-3 m² over the first 8 fixed test pairs, by the recipes' evaluation of the run before export.
-RECORDED: dict[str, float] = {}
-
-
-@pytest.mark.parametrize("name", sorted(RECORDED))
+@pytest.mark.parametrize("name", pretrained_names())
 @torch.no_grad()
 def test_figures_come_out_again(name):
+    """PMD of the first fixed test pairs against what the run's unrounded network had before export."""
     net = load_pretrained(name)
     body, split = load_shipped(net.card["data"])
+    recorded = net.card["first_pairs_pmd"][
+        : 8 if net.card["data"] == "humans" else 3
+    ]  # animals take three times longer
     scores = []
-    for a, p, b, q in split.test_pairs[:8].tolist():
+    for a, p, b, q in split.test_pairs[: len(recorded)].tolist():
         identity, pose, truth = body(torch.tensor([a, b, a]), torch.tensor([p, q, q]))
         posed = net(identity, pose, identity_faces=body.faces, pose_faces=body.faces)
-        scores.append(1e3 * pmd(posed[None], center(truth[None])))
-    # 5 % and a little: 16-bit parameters, and eigenvectors that depend on the order of the vertices.
-    assert float(torch.cat(scores).mean()) == pytest.approx(RECORDED[name], rel=0.05, abs=0.02)
+        scores.append(1e3 * float(pmd(posed[None], center(truth[None]))[0]))
+    # 5 % and a little: 16-bit parameters, and eigenvectors that differ with the libraries.
+    assert sum(scores) / len(scores) == pytest.approx(sum(recorded) / len(recorded), rel=0.05, abs=0.02)
