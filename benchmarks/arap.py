@@ -4,6 +4,7 @@
     python benchmarks/arap.py --vertices 13774     # the 3445-vertex body, subdivided once
     python benchmarks/arap.py --compiled           # with the rotations through torch.compile as well
     python benchmarks/arap.py --finite-differences # check the gradients by differences, too
+    python benchmarks/arap.py --plot energy.png    # only the energy over the evaluations, as a picture
 
 A shipped body takes another pose: 10 % or 1 % of its vertices, or six patches at its ends, are handles. All entries run
 in one process on one thread and take turns; the smallest CPU time counts. The set-up of meshkit is that of a rest shape
@@ -130,6 +131,9 @@ def forward(case, args):
     x, evaluations = results["solve"]
     _, info = arap_deform(case.verts, case.faces, case.handles, case.goal, tol=1e-12, max_iter=3000, grad="none")
     lowest = info.energy.item()
+    exact = arap_deform(
+        case.verts, case.faces, case.handles, case.goal, method="local_global", max_iter=50, tol=0.0, grad="none"
+    )[1].energy.item()
     total = best["libigl set-up"] + best["libigl 50"]
     print(
         f"\n{case.kind} handles, {len(case.verts)} vertices; minimum {lowest:.6e} (converged: {bool(info.converged)})"
@@ -137,6 +141,7 @@ def forward(case, args):
     print("  " + "  ".join(f"{name} {value:.1f} ms" for name, value in best.items()))
     above = {
         "libigl 50": target,
+        "local-global 50, from rest and in float64": exact,
         f"solve ({evaluations})": case.energy(x),
         "solve 50": case.energy(results["solve 50"][0]),
     }
@@ -159,9 +164,9 @@ def gradients(case, posed, args):
         x, info = arap_deform(verts, case.faces, case.handles, goal, tol=tol, grad_tol=grad_tol, max_iter=3000)
         return (x - wave).square().mean(), (goal, verts), info
 
-    loss, inputs, info = run(1e-14, 1e-9)
+    loss, inputs, info = run(1e-18, 1e-10)
     exact = torch.autograd.grad(loss, inputs)
-    x = arap_deform(case.verts, case.faces, case.handles, case.goal, tol=1e-14, max_iter=3000, grad="none")[0]
+    x = arap_deform(case.verts, case.faces, case.handles, case.goal, tol=1e-18, max_iter=3000, grad="none")[0]
     upstream = 2 * (x - wave) / x.numel()
     adjoint = torch.zeros_like(x)
     adjoint[case.factor.free] = torch.from_numpy(case.factor.solve(upstream[case.factor.free].numpy()))
@@ -195,18 +200,68 @@ def gradients(case, posed, args):
 def differences(case, wave, x, exact):
     """Central differences along random directions."""
     generator = torch.Generator().manual_seed(1)
-    for name, gradient, size in zip(("handles", "rest"), exact, (3e-5, 2e-6), strict=True):
+    size = 3e-6
+    for name, gradient in zip(("handles", "rest"), exact, strict=True):
         direction = torch.randn(gradient.shape, generator=generator, dtype=torch.float64)
         values = []
         for sign in (1, -1):
             step = sign * size * direction
             verts = case.verts + step if name == "rest" else case.verts
             goal = case.goal + step if name == "handles" else case.goal
-            options = {"tol": 1e-16, "max_iter": 3000, "init": x, "grad": "none"}
+            options = {"tol": 1e-20, "max_iter": 3000, "init": x, "grad": "none"}
             moved, _ = arap_deform(verts, case.faces, case.handles, goal, **options)
             values.append((moved - wave).square().mean().item())
         slope, predicted = (values[0] - values[1]) / (2 * size), (gradient * direction).sum().item()
         print(f"  differences, {name}: {slope:.8e} against {predicted:.8e}, relative {abs(predicted / slope - 1):.1e}")
+
+
+class Recorder(Objective):
+    """Remembers the lowest energy after every evaluation."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.energies = []
+
+    def __call__(self, x):
+        energy, gradient = super().__call__(x)
+        self.energies.append(min([energy, *self.energies[-1:]]))
+        return energy, gradient
+
+
+def curves(case, count=100):
+    """Energies over m after each L-BFGS evaluation, and after each local-global iteration."""
+    start = case.rest.verts.clone()
+    start[case.handles] = case.goal - case.rest.origin
+    fast = Recorder(case.factor, None, dtype=torch.float32)
+    x = first = fast.global_step(start)
+    fast.start_from_rest()
+    minimise(fast, x, max_iter=count, tol=0.0, refine=False)
+    slow = Recorder(case.factor, None, dtype=torch.float64)
+    x = first
+    for _ in range(count):
+        _, gradient = slow(x)
+        x = x - slow.spread(slow.solve(gradient))  # with the rotations held: one global step
+    exact = Recorder(case.factor, None, dtype=torch.float64)
+    lowest = minimise(exact, first, max_iter=3000, tol=1e-12, refine=False).energy
+    return fast.energies, slow.energies, lowest
+
+
+def plot(verts, faces, posed, path):
+    """Energy above the minimum over the number of local steps, one panel per scenario."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(10, 3.2), sharey=True)
+    for axis, kind in zip(axes, ("10 %", "1 %", "6 patches"), strict=True):
+        fast, slow, lowest = curves(Case(verts, faces, posed, kind))
+        for energies, label, colour in ((slow, "local-global", "#d1603d"), (fast, "L-BFGS", "#3b6ea8")):
+            above = np.array(energies) / lowest - 1
+            axis.semilogy(np.arange(1, len(above) + 1), above.clip(1e-7), label=label, color=colour)
+        axis.axvline(50, color="0.8", linewidth=1, zorder=0)
+        axis.set(title=f"{kind} handles" if "%" in kind else kind, xlabel="evaluations", xlim=(0, 100), ylim=(1e-6, 30))
+    axes[0].set_ylabel("energy above the minimum")
+    axes[0].legend(frameon=False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
 
 
 def main():
@@ -215,6 +270,7 @@ def main():
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--compiled", action="store_true")
     parser.add_argument("--finite-differences", action="store_true")
+    parser.add_argument("--plot")
     args = parser.parse_args()
     try:
         import open3d  # noqa: F401
@@ -225,6 +281,9 @@ def main():
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", message="negative curvature")
     verts, faces, posed = body(args.vertices)
+    if args.plot:
+        plot(verts, faces, posed, args.plot)
+        return
     for kind in ("10 %", "1 %", "6 patches"):
         case = Case(verts, faces, posed, kind)
         forward(case, args)

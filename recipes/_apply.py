@@ -22,7 +22,7 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
         generator, model = load_generator(folder)
         meshes = [load_mesh(path) for path in files]
         for path, (verts, _) in zip(files, meshes, strict=True):
-            if len(verts) < model.k:
+            if model.architecture == "matching" and len(verts) < model.k:
                 raise UserError(f"{path}: {len(verts)} vertices; this model looks at {model.k} neighbours")
         descriptors: list[Tensor] | list[None] = [None, None]
         if model.descriptors == "wks":

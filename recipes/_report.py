@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from _data import Pairs, inputs
 from _run import Run
 from torch import Tensor, nn
 
@@ -16,37 +17,41 @@ from meshkit.viz import contact_sheet, error_colors, plot_curves, render
 
 
 @torch.no_grad()
-def evaluate(generator: nn.Module, pairs: PosePairs, device: torch.device, count: int) -> dict[str, float]:
-    """Means over ``count`` unseen pairs, of the output and of two baselines; PMD and Chamfer in 1e-3 square metres."""
+def evaluate(generator: nn.Module, pairs: Pairs, device: torch.device, count: int) -> dict[str, float]:
+    """Means over ``count`` unseen pairs, of the output and of two baselines; PMD and Chamfer in 1e-3 square metres.
+
+    Empty where neither ground truth nor correspondence is known.
+    """
     training = generator.training
     generator.eval()
     columns: dict[str, list[Tensor]] = {}
-    for start in range(0, count, 4):
-        batch = pairs[[(0, i) for i in range(start, min(start + 4, count))]].to(device)
-        result = generate(generator, batch)
+    together = 4 if isinstance(pairs, PosePairs) else 1  # meshes from files differ in size
+    for start in range(0, count, together):
+        batch = pairs[[(0, i) for i in range(start, min(start + together, count))]].to(device)
+        result = generate(generator, batch, start)
         candidates = {"": result.vertices, "_copy_identity": batch.identity}
         if result.warped is not None:
             candidates["_copy_warped"] = result.warped
-        for name, verts in candidates.items():
+        for name, verts in candidates.items() if batch.ground_truth.shape[1] else ():
             columns.setdefault(f"pmd{name}", []).append(1e3 * pmd(verts, batch.ground_truth))
             columns.setdefault(f"chamfer{name}", []).append(1e3 * chamfer_distance(center(verts), batch.ground_truth))
-        if result.plan is not None:
+        if result.plan is not None and bool((batch.correspondence >= 0).all()):
             matched = correspondence_error(result.plan.argmax(), batch.pose, batch.correspondence)
             columns.setdefault("correspondence_m", []).append(matched)
     generator.train(training)
     return {name: round(float(torch.cat(values).mean()), 4) for name, values in columns.items()}
 
 
-def generate(generator: nn.Module, batch: PairBatch) -> Any:
-    return generator(
-        batch.identity,
-        batch.pose,
-        identity_descriptors=batch.identity_descriptors,
-        pose_descriptors=batch.pose_descriptors,
-    )
+def generate(generator: nn.Module, batch: PairBatch, place: int) -> Any:
+    """The generator's result; one that is told more than the meshes takes the batch and its place among the pairs."""
+    if getattr(generator, "takes_batches", False):
+        return generator(batch, place)
+    # With both hands of the identity to match, a generator wants to know what hangs together.
+    faces = {"identity_faces": batch.identity_faces} if getattr(generator, "symmetry", False) else {}
+    return generator(batch.identity, batch.pose, **inputs(batch), **faces)
 
 
-def report(run: Run, generator: nn.Module, pairs: PosePairs, device: torch.device, facts: dict[str, Any]) -> None:
+def report(run: Run, generator: nn.Module, pairs: Pairs, device: torch.device, facts: dict[str, Any]) -> None:
     """Evaluate on unseen pairs; write summary.json, curves.png, sheet.png and meshes/."""
     figures = evaluate(generator, pairs, device, len(pairs))
     summary = {
@@ -61,7 +66,7 @@ def report(run: Run, generator: nn.Module, pairs: PosePairs, device: torch.devic
     run.save_json("summary.json", summary)
     draw_curves(run)
     draw_sheet(run, generator, pairs, device)
-    print(f"\n{len(pairs)} unseen pairs        PMD e-3   Chamfer e-3")
+    print(f"\n{len(pairs)} unseen pairs        PMD e-3   Chamfer e-3" if "pmd" in figures else "")
     for title, key in (("copy the identity", "_copy_identity"), ("copy the warped", "_copy_warped"), ("output", "")):
         if f"pmd{key}" in figures:
             print(f"  {title:<20} {figures[f'pmd{key}']:8.2f}   {figures[f'chamfer{key}']:8.2f}")
@@ -83,7 +88,7 @@ def draw_curves(run: Run) -> None:
         smooth = torch.nn.functional.avg_pool1d(values[None], window, window)[0]
         series[name] = (torch.nn.functional.avg_pool1d(minutes[None], window, window)[0], smooth)
     plot_curves(run.path("curves.png"), series, xlabel="training time (minutes)", ylabel="weighted loss", logy=True)
-    points = [(r["seconds"] / 60, r["eval"]["pmd"]) for r in records if "eval" in r]
+    points = [(r["seconds"] / 60, r["eval"]["pmd"]) for r in records if "pmd" in r.get("eval", {})]
     if points:
         plot_curves(
             run.path("pmd.png"),
@@ -95,38 +100,33 @@ def draw_curves(run: Run) -> None:
 
 
 @torch.no_grad()
-def draw_sheet(run: Run, generator: nn.Module, pairs: PosePairs, device: torch.device, rows: int = 6) -> None:
-    rows = min(rows, len(pairs))
-    batch = pairs[[(0, i) for i in range(rows)]].to(device)
+def draw_sheet(run: Run, generator: nn.Module, pairs: Pairs, device: torch.device, rows: int = 6) -> None:
+    """Rows of pictures, and the meshes as files; ground truth and error where they are known."""
     generator.eval()
-    result = generate(generator, batch)
-    output = center(result.vertices)
-    warped = None if result.warped is None else center(result.warped)
-    worst, sheet, captions = 0.15, [], []
-    for b in range(rows):
-        faces, truth = batch.identity_faces[b], batch.ground_truth[b]
-        views = [
-            (batch.identity[b], faces, None),
-            (batch.pose[b], batch.pose_faces[b], None),
-            *([] if warped is None else [(warped[b], faces, None)]),
-            (output[b], faces, None),
-            (truth, faces, None),
-            (output[b], faces, error_colors((output[b] - truth).norm(dim=1), vmax=worst)),
-        ]
+    worst, sheet, captions, titles = 0.15, [], [], [""]
+    for b in range(min(rows, len(pairs))):
+        batch = pairs[[(0, b)]].to(device)
+        result = generate(generator, batch, b)
+        faces, output = batch.identity_faces[0], center(result.vertices)[0]
+        views: dict[str, tuple[Tensor, Tensor, Any]] = {"identity": (batch.identity[0], faces, None)}
+        views["pose"] = (batch.pose[0], batch.pose_faces[0], None)
+        if result.warped is not None:
+            views["warped"] = (center(result.warped)[0], faces, None)
+        views["output"] = (output, faces, None)
+        captions.append([""] * len(views))
+        if batch.ground_truth.shape[1]:
+            truth = batch.ground_truth[0]
+            views["ground truth"] = (truth, faces, None)
+            views["error"] = (output, faces, error_colors((output - truth).norm(dim=1), vmax=worst))
+            captions[-1][-1] = f"PMD {1e3 * float(pmd(output[None], batch.ground_truth)):.1f}e-3"
+            captions[-1] += ["", ""]
         # One scale per row, so that sizes can be compared.
-        everything = torch.cat([verts for verts, _, _ in views])
+        everything = torch.cat([verts for verts, _, _ in views.values()])
         bounds = torch.stack([everything.amin(0), everything.amax(0)])
-        sheet.append([render(verts, f, colors=colors, bounds=bounds) for verts, f, colors in views])
-        score = 1e3 * float(pmd(output[b : b + 1], batch.ground_truth[b : b + 1]))
-        captions.append([""] * (len(views) - 3) + [f"PMD {score:.1f}e-3", "", ""])
-        for name, verts, f in (
-            ("identity", batch.identity[b], faces),
-            ("pose", batch.pose[b], batch.pose_faces[b]),
-            ("output", output[b], faces),
-            ("ground_truth", truth, faces),
-        ):
-            save_mesh(run.path("meshes") / f"pair{b}_{name}.obj", verts, f)
-    titles = ["identity", "pose", *([] if warped is None else ["warped"]), "output", "ground truth", "error"]
-    contact_sheet(
-        sheet, column_titles=titles, captions=captions, colorbar=(0.0, 100 * worst, "distance to ground truth (cm)")
-    ).save(run.path("sheet.png"))
+        sheet.append([render(verts, f, colors=colors, bounds=bounds) for verts, f, colors in views.values()])
+        titles = list(views)
+        for name in ("identity", "pose", "output", "ground truth"):
+            if name in views:
+                save_mesh(run.path("meshes") / f"pair{b}_{name.replace(' ', '_')}.obj", *views[name][:2])
+    colorbar = (0.0, 100 * worst, "distance to ground truth (cm)") if "error" in titles else None
+    contact_sheet(sheet, column_titles=titles, captions=captions, colorbar=colorbar).save(run.path("sheet.png"))

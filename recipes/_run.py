@@ -1,19 +1,20 @@
-"""Plumbing that recipes share: the run's folder, checkpoints, log, thread count and precision. No numerics."""
+"""Plumbing that recipes share: the run's folder, checkpoints and log; errors told in one line. No numerics."""
 
 from __future__ import annotations
 
-import ctypes
+import importlib.util
 import json
-import os
-import platform
+import shutil
 import signal
 import sys
-import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from safetensors import safe_open
+from _machine import machine, rank
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -35,10 +36,8 @@ def guard(main: Any, *arguments: Any) -> None:
         print(f"error: {error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
-        print(
-            "\ninterrupted; --resume goes on from the last checkpoint, or begins again if there is none",
-            file=sys.stderr,
-        )
+        advice = "--resume goes on from the last checkpoint, or begins again if there is none"
+        print(f"\ninterrupted; {advice}", file=sys.stderr)
         raise SystemExit(130) from None
 
 
@@ -46,27 +45,51 @@ class Run:
     """The folder of a run: ``config.json``, ``state.pt``, ``model.safetensors``, ``model.json``, ``log.jsonl``.
 
     ``state.pt`` and ``config.json`` are what a resumed run needs. Every file but the log is replaced whole; the log is
-    cut back to the step that a resumed run starts from.
+    cut back to the step that a resumed run starts from. Of several processes all read and the first alone writes.
     """
 
     def __init__(self, folder: Path, *, resume: bool) -> None:
-        self.folder = folder
+        self.folder, self.writes = folder, rank() == 0
         self.log_file = folder / "log.jsonl"
+        self.saved: int | None = None
+        self._board: Any = None
         if (folder / "state.pt").exists() and not resume:
             raise UserError(f"{folder} holds a run already: go on with --resume, or choose another --name")
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with atomic_write(folder / "machine.json") as path:
-                path.write_text(json.dumps(machine(), indent=2))
+            if self.writes:
+                with atomic_write(folder / "machine.json") as path:
+                    path.write_text(json.dumps(machine(), indent=2))
         except OSError as error:
             raise UserError(f"cannot write to {folder}: {error.strerror}. Choose another folder with --out") from None
 
     def path(self, name: str) -> Path:
         return self.folder / name
 
+    @contextmanager
+    def replacing(self, name: str) -> Iterator[Path]:
+        """Write a file whole or not at all; where that fails, for want of space or otherwise, the old one remains."""
+        try:
+            with atomic_write(self.folder / name) as path:
+                yield path
+        except (OSError, RuntimeError, SafetensorError) as error:
+            raise self._unwritable(name, error) from None
+
+    def _unwritable(self, name: str, error: Exception) -> UserError:
+        # torch and safetensors report a full disk as an error of their own, without saying why the write failed.
+        full = shutil.disk_usage(self.folder).free < 1 << 20
+        reason = getattr(error, "strerror", None) or ("No space left on device" if full else str(error).split("\n")[0])
+        said = f"cannot write {self.folder / name}: {reason}; {self.last_checkpoint()}"
+        return UserError(f"{said}. Make room, then --resume")
+
+    def last_checkpoint(self) -> str:
+        usable = f"the last checkpoint, {self.folder / 'state.pt'} after step {self.saved}, is usable"
+        return "there is no checkpoint yet" if self.saved is None else usable
+
     def save_json(self, name: str, value: Any) -> None:
-        with atomic_write(self.folder / name) as path:
-            path.write_text(json.dumps(value, indent=2) + "\n")
+        if self.writes:
+            with self.replacing(name) as path:
+                path.write_text(json.dumps(value, indent=2) + "\n")
 
     def load_json(self, name: str) -> Any:
         path = self.folder / name
@@ -76,9 +99,10 @@ class Run:
             raise UserError(f"{path} is damaged: delete {self.folder} or choose another --name") from None
 
     def save_tensors(self, name: str, tensors: dict[str, Tensor], made_from: str = "") -> None:
-        with atomic_write(self.folder / name) as path:
+        if self.writes:
             values = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
-            save_file(values, path, metadata={"made_from": made_from})
+            with self.replacing(name) as path:
+                save_file(values, path, metadata={"made_from": made_from})
 
     def load_tensors(self, name: str, made_from: str = "") -> dict[str, Tensor] | None:
         """The tensors saved under ``name``, or ``None`` if there are none made from the same things."""
@@ -94,10 +118,13 @@ class Run:
             raise UserError(f"{path} is damaged: delete it and start again") from None
 
     def save_state(self, model: nn.Module, optimizer: torch.optim.Optimizer, step: int, extra: dict[str, Any]) -> None:
-        state = {"model": model.state_dict(), "optimizer": optimizer.state_dict(), "step": step, **extra}
-        with atomic_write(self.folder / "state.pt") as path:
-            torch.save(state, path)
-        self.save_tensors("model.safetensors", model.state_dict())
+        """A checkpoint. It holds no state of random numbers: all follow from the seed and the step."""
+        if self.writes:
+            state = {"model": model.state_dict(), "optimizer": optimizer.state_dict(), "step": step, **extra}
+            with self.replacing("state.pt") as path:
+                torch.save(state, path)
+            self.saved = step
+            self.save_tensors("model.safetensors", model.state_dict())
 
     def load_state(self) -> dict[str, Any] | None:
         path = self.folder / "state.pt"
@@ -105,15 +132,31 @@ class Run:
             return None
         try:
             state = dict(torch.load(path, map_location="cpu", weights_only=True))
-            return {key: state[key] for key in ("model", "optimizer", "step", "seconds", "waiting")}
+            known = {key: state[key] for key in ("model", "optimizer", "step", "seconds", "waiting")}
         except Exception:
-            raise UserError(
-                f"{path} is not a readable checkpoint: delete {self.folder} or choose another --name"
-            ) from None
+            advice = f"delete {self.folder} or choose another --name"
+            raise UserError(f"{path} is not a readable checkpoint: {advice}") from None
+        self.saved = known["step"]
+        return known | {"pairs_per_step": state.get("pairs_per_step")}
 
-    def log(self, **values: Any) -> None:
-        with self.log_file.open("a") as stream:
-            stream.write(json.dumps(values) + "\n")
+    def log(self, record: dict[str, Any]) -> None:
+        """A line of the log, and the same for TensorBoard where that is installed."""
+        if not self.writes:
+            return
+        try:
+            with self.log_file.open("a") as stream:
+                stream.write(json.dumps(record) + "\n")
+            if self._board is None and importlib.util.find_spec("tensorboard") is not None:
+                from torch.utils.tensorboard import SummaryWriter
+
+                # Points of an earlier life of the run that come after this step are forgotten.
+                self._board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=record["step"])
+            if self._board is not None:
+                for name, value in (record | record.get("eval", {})).items():
+                    if isinstance(value, float):
+                        self._board.add_scalar(name, value, record["step"])
+        except OSError as error:
+            raise self._unwritable(self.log_file.name, error) from None
 
     def read_log(self) -> list[dict[str, Any]]:
         """All complete lines; a line cut off by a kill is left out."""
@@ -128,73 +171,30 @@ class Run:
 
     def cut_log(self, step: int) -> None:
         """Forget what was logged after ``step``: the resumed run logs it again."""
-        records = [record for record in self.read_log() if record["step"] <= step]
-        with atomic_write(self.log_file) as path:
-            path.write_text("".join(json.dumps(record) + "\n" for record in records))
+        if self.writes:
+            records = [record for record in self.read_log() if record["step"] <= step]
+            with self.replacing(self.log_file.name) as path:
+                path.write_text("".join(json.dumps(record) + "\n" for record in records))
 
 
 class Interruption:
-    """Turns the first Ctrl-C into a wish to stop after the step at hand; a second one interrupts at once."""
+    """Turns the first Ctrl-C into a wish to stop after the step at hand; a second one interrupts at once.
 
-    def __init__(self) -> None:
-        self.wanted = False
+    The processes of a run agree on it: one that was asked to stop stops all.
+    """
+
+    def __init__(self, fabric: Any) -> None:
+        self._fabric, self._asked = fabric, False
         self._previous = signal.signal(signal.SIGINT, self._note)
 
+    @property
+    def wanted(self) -> bool:
+        """To be read by all processes at the same time."""
+        if self._fabric.world_size == 1:
+            return self._asked
+        asked = torch.tensor(float(self._asked), device=self._fabric.device)
+        return bool(self._fabric.all_reduce(asked, reduce_op="sum") > 0)
+
     def _note(self, *_: Any) -> None:
-        self.wanted = True
+        self._asked = True
         signal.signal(signal.SIGINT, self._previous)
-
-
-def machine() -> dict[str, Any]:
-    """What the run's figures depend on."""
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "platform": platform.platform(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
-def keep_freed_memory() -> None:
-    """Let glibc keep large freed blocks for the next step instead of returning them to the system each time.
-
-    A training step frees and takes the same buffers over and over; faulting them in anew costs 15-20 % of a step on
-    the CPU. Does nothing where the C library is another one.
-    """
-    try:
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-    except (OSError, AttributeError):
-        return
-    trim_threshold, mmap_threshold = -1, -3
-    mallopt(mmap_threshold, 1 << 30)
-    mallopt(trim_threshold, (1 << 31) - 1)
-
-
-def pick_precision(device: torch.device) -> Literal["bf16-mixed", "32-true"]:
-    """``"bf16-mixed"`` where a bfloat16 product measures at least 1.5 times faster than float32, else full precision.
-
-    Processors without bfloat16 instructions emulate them at a twentieth of the speed, so the name of the type says
-    nothing about its speed.
-    """
-
-    def seconds(dtype: torch.dtype) -> float:
-        x = torch.ones(1024, 256, dtype=dtype, device=device)
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            float((x @ x[:256].mT).sum())
-            times.append(time.perf_counter() - start)
-        return min(times)
-
-    return "bf16-mixed" if seconds(torch.float32) > 1.5 * seconds(torch.bfloat16) else "32-true"

@@ -30,20 +30,23 @@ class Settings:
     """Folder that holds the runs."""
     resume: bool = False
     """Go on from the run's last checkpoint, if it has one, with the settings it was begun with: of the other flags only
-    --out, --name, --threads and --accelerator count then."""
+    --out, --name, --threads, --accelerator and --devices count then."""
     apply: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="IDENTITY POSE")] = None
     """Do not train: give the first mesh file the pose of the second, with the weights of run --name."""
     result: Path = Path("posed.obj")
     """Where --apply writes the posed mesh."""
 
     data: str = "humans"
-    """What to train on: humans or animals, which ship with meshkit."""
+    """What to train on: humans or animals, which ship with meshkit; smpl:<file> or smal:<file>, a licensed model;
+    faust:<folder>, mgn:<folder>, or folder:<folder> of meshes named {identity}_{pose}.obj."""
     minutes: float | None = 8.0
     """Training time; turned into a number of steps once, by the measured speed, and recorded. Paper: 24 to 90 hours."""
     steps: int | None = None
     """Number of steps, instead of --minutes. Paper: 200 epochs of 1600 (X-DualNet)."""
     batch: int = 4
-    """Pairs per step. Paper: 4."""
+    """Pairs per step, of each process. Paper: 4 (X-DualNet, humans), 6 (animals), 8 (3D-CoreNet)."""
+    accumulate: int = 1
+    """Batches of this size whose gradients are averaged before each update: larger batches in the same memory."""
     pairs: int = 6400
     """Training pairs per epoch. Paper: 6400 humans, 9000 animals."""
     resample: bool = True
@@ -86,6 +89,10 @@ class Settings:
     """Record a training step as a CUDA graph and replay it: several times faster for small networks on a GPU."""
     accelerator: str = "auto"
     """Where to train: auto, cpu, cuda, mps."""
+    devices: int = 1
+    """Processes, one per GPU or share of the processor. Under torchrun its own flags count instead."""
+    compile: bool = False
+    """torch.compile what is trained: a minute or more at the start, for faster steps."""
 
 
 S = TypeVar("S", bound=Settings)

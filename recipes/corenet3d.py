@@ -1,6 +1,7 @@
 """3D-CoreNet: supervised 3D pose transfer with correspondence learning (Song et al.), the generator of X-DualNet.
 
     python recipes/corenet3d.py                     # train on the shipped humans, on a laptop's CPU
+    python recipes/corenet3d.py --norm spadain      # the paper's ablation: SPAdaIN instead of ElaIN
     python recipes/corenet3d.py --preset small      # more of everything: hours on a CPU, minutes on a GPU
     python recipes/corenet3d.py --name corenet3d --apply identity.obj pose.obj --result posed.obj
 
@@ -10,10 +11,12 @@ released 3D-CoreNet's. A run writes what a run of ``xdualnet.py`` writes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from _apply import apply
+from _data import inputs
 from _run import guard
 from _settings import Settings, parse
 from _train import train
@@ -34,6 +37,8 @@ class Config(Settings):
     """Weight of the reconstruction. Released code: 1000."""
     lambda_edge: float = 0.5
     """Weight of the edge loss (length ratios). Released code: 0.5."""
+    norm: Literal["elain", "spadain"] = "elain"
+    """Conditional norm of the blocks; spadain is the paper's ablation of ElaIN."""
 
 
 PRESETS = {
@@ -80,14 +85,9 @@ def build(cfg: Config) -> tuple[torch.nn.Module, torch.nn.Module]:
 
 def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float) -> dict[str, Tensor]:
     """The weighted losses of one step."""
-    output = system(
-        batch.identity,
-        batch.pose,
-        identity_descriptors=batch.identity_descriptors,
-        pose_descriptors=batch.pose_descriptors,
-    ).vertices
+    output = system(batch.identity, batch.pose, **inputs(batch)).vertices
     return {
-        "rec": cfg.lambda_rec * reconstruction_loss(output, batch.ground_truth),
+        "rec": cfg.lambda_rec * reconstruction_loss(output, batch.ground_truth, mask=batch.identity_mask),
         "edge": cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces),
     }
 
@@ -98,7 +98,7 @@ def main() -> None:
     if cfg.apply is not None:
         apply(cfg.out / cfg.name, cfg.apply, cfg.result)
     else:
-        train(cfg, build, step)
+        train(replace(cfg, model=replace(cfg.model, norm=cfg.norm)), build, step)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """X-DualNet: unsupervised 3D pose transfer with cross consistency and dual reconstruction (Song et al.).
 
     python recipes/xdualnet.py                      # train on the shipped humans, on a laptop's CPU
-    python recipes/xdualnet.py --data animals       # the shipped animals
+    python recipes/xdualnet.py --data animals       # the shipped animals; for other data see --help
     python recipes/xdualnet.py --preset small       # more of everything: hours on a CPU, minutes on a GPU
     python recipes/xdualnet.py --preset paper       # the paper's sizes and schedule
     python recipes/xdualnet.py --name demo --apply identity.obj pose.obj --result posed.obj
@@ -17,6 +17,7 @@ from typing import ClassVar, Literal
 
 import torch
 from _apply import apply
+from _data import inputs
 from _run import guard
 from _settings import Settings, parse
 from _train import train
@@ -116,22 +117,24 @@ def build(cfg: Config) -> tuple[torch.nn.Module, torch.nn.Module]:
 
 def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float) -> dict[str, Tensor]:
     """The weighted losses of one step; the ARAP deformer joins late in the run."""
-    descriptors = {
-        "identity_descriptors": batch.identity_descriptors,
-        "pose_descriptors": batch.pose_descriptors,
-    }
     use_deform = cfg.arap and progress >= cfg.arap_from
     # O = G(A, B);  Ô = ARAP(A, O);  A' = G(Ô, A) ≈ A;  B' = G(B, Ô) ≈ B
     result = system(
-        batch.identity, batch.pose, identity_faces=batch.identity_faces, use_deform=use_deform, **descriptors
+        batch.identity, batch.pose, identity_faces=batch.identity_faces, use_deform=use_deform, **inputs(batch)
     )
     output = result.output
     losses = {
-        "rec_a": cfg.lambda_rec * reconstruction_loss(result.reconstruction_a, result.target_a),
-        "rec_b": cfg.lambda_rec * reconstruction_loss(result.reconstruction_b, result.target_b),
+        "rec_a": cfg.lambda_rec * reconstruction_loss(result.reconstruction_a, result.target_a, mask=result.mask_a),
+        "rec_b": cfg.lambda_rec * reconstruction_loss(result.reconstruction_b, result.target_b, mask=result.mask_b),
     }
     if cfg.corr:
-        back = backward_correspondence_loss(result.plan, result.target_b, normalization=cfg.corr_normalization)
+        back = backward_correspondence_loss(
+            result.plan,
+            result.target_b,
+            normalization=cfg.corr_normalization,
+            mask=result.mask_b,
+            identity_mask=batch.identity_mask,
+        )
         losses["corr"] = cfg.lambda_corr * back
     if cfg.edge == "ratio":
         losses["edge"] = cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces)

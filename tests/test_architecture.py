@@ -21,7 +21,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "batching": set(),
     "scatter": set(),
     "topology": {"batching", "scatter"},
-    "neighbors": {"batching", "scatter"},
+    "neighbors": {"_numerics", "batching", "scatter"},
     "descriptors": FOUNDATION,
     "ot": FOUNDATION,
     "norm": FOUNDATION,

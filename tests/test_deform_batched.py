@@ -7,10 +7,12 @@ import torch
 from conftest import rand
 
 from meshkit.data import load_humans
-from meshkit.deform import ARAPDeformer, ARAPInfo, arap_deform, closest_rotation
+from meshkit.deform import ARAPDeformer, ARAPInfo, arap_deform, arap_energy, closest_rotation
 from meshkit.deform.batched import BatchedEnergy
 from meshkit.deform.batched_factor import BatchedFactor
+from meshkit.deform.batched_objective import BatchedObjective, alternate_batch
 from meshkit.deform.batched_rotation import BatchedRotation
+from meshkit.deform.energy import energy_of_batch
 from meshkit.topology import connected_components, cotangent_laplacian
 
 ENERGIES = ["spokes_and_rims", "spokes", "spokes_unclamped", "elements"]
@@ -127,6 +129,24 @@ def test_factor_solves(device: str, solver: str) -> None:
         assert not got[b][~own].any()
 
 
+@ON_DEVICES
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_energy_and_its_gradients(device: str, energy: str) -> None:
+    verts, faces, _, _, mask = ragged()
+    deformed = verts + 0.2 * rand(*verts.shape, seed=8)
+    results = []
+    for place, function in (("cpu", arap_energy), (device, energy_of_batch)):
+        leaves = [value.clone().to(place).requires_grad_() for value in (verts, deformed)]
+        options: dict[str, Any] = {"energy": energy, "mask": mask.to(place), "degenerate": "raise"}
+        values = function(leaves[0], faces.to(place), leaves[1], **options)
+        (values * rand(3, seed=1).to(place)).sum().backward()
+        results.append([value.cpu() for value in (values, *(leaf.grad for leaf in leaves))])
+    for got, expected in zip(results[1], results[0], strict=True):
+        torch.testing.assert_close(got, expected, rtol=1e-8, atol=1e-9)
+    assert energy_of_batch(verts, faces, deformed[:, 1:], **options) is None
+    assert energy_of_batch(verts, faces, deformed, **options | {"mask": None}) is None  # NaN in the padding
+
+
 # ---------------------------------------------------------------- deformation
 
 
@@ -203,6 +223,18 @@ def test_all_vertices_fixed(device: str) -> None:
 
 
 @ON_DEVICES
+def test_degenerate_faces_and_edges_of_three_faces_may_stay(device: str) -> None:
+    verts, faces = grid(5, seed=0)
+    fin = torch.cat([verts, verts[:1] + 1.0])
+    faces = torch.cat([faces, torch.tensor([[int(faces[0, 0]), int(faces[0, 1]), 25], [3, 3, 4]])])
+    inputs: dict[str, Any] = {"verts": fin, "faces": faces, "handles": torch.tensor([0, 4, 22])}
+    inputs["handle_pos"] = fin[[0, 4, 22]] + 0.5 * rand(3, 3)
+    (x, info, _), (got, own, _) = both(device, inputs, degenerate="ignore", **TIGHT)
+    assert info.converged and own.converged
+    torch.testing.assert_close(got, x, rtol=0, atol=1e-6)
+
+
+@ON_DEVICES
 def test_a_saddle_is_reported(device: str) -> None:
     verts, faces = (value.to(device) for value in grid(5, seed=0))
     handles = torch.tensor([0, 4, 20, 24], device=device)
@@ -225,6 +257,14 @@ def test_bad_input_is_described_by_the_other_path(device: str) -> None:
     flat[faces[0, 0]] = flat[faces[0, 1]]
     for change, message in (
         ({"verts": loose}, "1 vertices are in no face of positive area and are no handles"),
+        (
+            {"verts": torch.cat([verts, verts + 9]), "faces": torch.cat([faces, faces + 16])},
+            "1 connected components have no handle",
+        ),
+        (
+            {"verts": verts[faces].view(-1, 3), "faces": torch.arange(54).view(18, 3).to(device)},
+            "the mesh is in 18 pieces, which are 1 once",
+        ),
         ({"verts": nan}, "verts holds NaN"),
         ({"verts": flat}, "faces have an edge of length zero"),
         ({"verts": verts.long()}, "verts must be a floating"),
@@ -307,18 +347,19 @@ def test_iterations_do_not_wait_for_the_device() -> None:
     rig = load_humans(1000)
     rest, faces = rig.shape(torch.arange(4))[0].cuda(), rig.faces.cuda().expand(4, -1, 3)
     target = rig(torch.arange(4), torch.arange(4)).cuda().requires_grad_()
-    from meshkit.deform.batched_objective import BatchedObjective, alternate_batch
-
     energy = BatchedEnergy(rest, faces, torch.ones(4, 1000, dtype=torch.bool, device="cuda"), "spokes_and_rims")
     fixed = (torch.arange(1000, device="cuda") % 10 == 0).expand(4, -1)
-    factor = BatchedFactor(energy, ~fixed, None, "dense")
-    objective = BatchedObjective(factor, None)
-    alternate_batch(objective, rest.double().flatten(0, 1), None, max_iter=2, tol=0.0)  # constants are copied once
-    goal = torch.where(fixed[..., None], target.double() - energy.origin, 0.0).flatten(0, 1)
+    objective = BatchedObjective(BatchedFactor(energy, ~fixed, None, "dense"), None)
+
+    def run() -> torch.Tensor:
+        goal = torch.where(fixed[..., None], target.double() - energy.origin, 0.0).flatten(0, 1)
+        x, _ = alternate_batch(objective, goal, None, max_iter=3, tol=0.0)
+        return torch.autograd.grad(x.square().sum(), target)[0]
+
+    run()  # constants are copied to the device once
     torch.cuda.set_sync_debug_mode("error")
     try:
-        x, _ = alternate_batch(objective, goal, None, max_iter=5, tol=0.0)
-        (gradient,) = torch.autograd.grad(x.square().sum(), target)
+        gradient = run()
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert gradient.isfinite().all()

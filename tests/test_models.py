@@ -242,6 +242,24 @@ def test_pointwise_errors():
         PoseTransferGenerator(extractor="dgcnn")
 
 
+def test_spadain_replaces_elain_in_the_blocks():
+    """The stack by its equations, with scale and shift from the condition and statistics over the vertices."""
+    net, warped = make(norm="spadain", spectral=False), rand(1, 12, 3)
+    cond = rand(1, 12, net.transfer.blocks[0].norm_0.cond_features, seed=1)
+
+    def branch(block, which, x):
+        norm, conv = getattr(block, f"norm_{which}"), getattr(block, f"conv_{which}")
+        standard = (x - x.mean(1)) / (x.var(1, unbiased=False) + 1e-5).sqrt()
+        return conv(nn.functional.leaky_relu(norm.gamma(cond) * standard + norm.beta(cond), 0.2))
+
+    x = net.transfer.mix(net.transfer.lift(warped))
+    for block, narrow in zip(net.transfer.blocks, net.transfer.narrow, strict=True):
+        x = narrow(branch(block, "s", x) + branch(block, "1", branch(block, "0", x)))
+    assert_near(net.transfer(warped, cond), 2 * torch.tanh(x), 1e-9)
+    with pytest.raises(ValueError, match='norm must be "elain" or "spadain", got \'batch\''):
+        PoseTransferGenerator(norm="batch")
+
+
 def test_theta_and_phi_stand_before_the_matching():
     net, identity, pose = make(extractor="pointwise", eps=0.3), rand(1, 12, 3), rand(1, 17, 3, seed=1)
     f_id, f_pose = net.encode(identity), net.encode(pose)
@@ -586,7 +604,7 @@ def test_presets():
     assert [b.conv_0.in_features for b in npt().decoder.blocks] == [1027, 513, 256]
     assert [b.conv_0.in_features for b in npt(preset="tiny").decoder.blocks] == [256, 128, 64]
     for build in (xdualnet, corenet3d, lambda size: npt(preset=size)):
-        with pytest.raises(ValueError, match=r"preset must be one of \['paper', 'tiny'\], got 'huge'"):
+        with pytest.raises(ValueError, match=r"preset must be one of \['paper', 'small', 'tiny'\], got 'huge'"):
             build("huge")
     with pytest.raises(ValueError, match='variant must be "maxpool" or "original"'):
         npt("paper")

@@ -1,6 +1,5 @@
 """The X-DualNet recipe as a user runs it: what a run leaves, what a killed one resumes, what mistakes are answered."""
 
-import importlib
 import json
 import os
 import re
@@ -17,19 +16,17 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from recipe_runs import ROOT, command, environment, launch, read_json, read_log, recipe_module
 from safetensors.torch import load_file
 from scipy.spatial import cKDTree
 
-from meshkit.data import MeshPool, PosePairs, human_split, load_humans
+from meshkit.data import MeshPool, PairSampler, PosePairs, human_split, load_humans, pair_loader
 from meshkit.io import load_mesh, save_mesh
-from meshkit.losses import edge_length_loss, edge_ratio_loss
 from meshkit.models import GeneratorConfig, load_generator
 
 pytest.importorskip("tyro")
-pytest.importorskip("lightning_fabric")
+Fabric = pytest.importorskip("lightning_fabric").Fabric
 
-ROOT = Path(__file__).parents[1]
-SCRIPT = ROOT / "recipes" / "xdualnet.py"
 STEPS, BATCH, EVAL_PAIRS = 8, 2, 4
 # The processor and full precision, so that runs repeat bit for bit wherever the tests run.
 TINY = (
@@ -38,42 +35,26 @@ TINY = (
 ).split()
 
 
-def command(*arguments: Any) -> list[str]:
-    return [sys.executable, str(SCRIPT), *map(str, arguments)]
-
-
-def environment() -> dict[str, str]:
-    return os.environ | {"OMP_NUM_THREADS": "1"}
-
-
-def launch(*arguments: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        command(*arguments), cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=300, check=False
-    )
-
-
-def read_log(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    return json.loads(file.read_text())
+@pytest.fixture(scope="module")
+def recipe() -> ModuleType:
+    return recipe_module("xdualnet")
 
 
 @pytest.fixture(scope="module")
-def recipe() -> ModuleType:
-    sys.path.insert(0, str(SCRIPT.parent))
-    try:
-        return importlib.import_module("xdualnet")
-    finally:
-        sys.path.remove(str(SCRIPT.parent))
+def setup() -> ModuleType:
+    return recipe_module("_setup")
+
+
+@pytest.fixture(scope="module")
+def loop() -> ModuleType:
+    return recipe_module("_step")
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
     """A whole run in the folder ``runs/whole`` of its own base folder, shared by the tests: they must not change it."""
     out = tmp_path_factory.mktemp("finished")
-    run = launch("--out", out, "--name", "whole", "--steps", STEPS, *TINY)
+    run = launch("xdualnet", "--out", out, "--name", "whole", "--steps", STEPS, *TINY)
     assert run.returncode == 0, run.stderr
     return run
 
@@ -208,7 +189,11 @@ def test_a_killed_run_resumes_as_if_nothing_had_happened(whole: Path, tmp_path: 
     folder = tmp_path / "killed"
     arguments = ("--out", tmp_path, "--name", "killed", "--steps", STEPS, *TINY)
     with subprocess.Popen(
-        command(*arguments), cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        command("xdualnet", *arguments),
+        cwd=ROOT,
+        env=environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     ) as process:
         deadline = time.monotonic() + 120
         while not (folder / "state.pt").exists() and process.poll() is None and time.monotonic() < deadline:
@@ -222,7 +207,7 @@ def test_a_killed_run_resumes_as_if_nothing_had_happened(whole: Path, tmp_path: 
     with (folder / "log.jsonl").open("a") as stream:
         stream.write(json.dumps(read_log(whole)[reached] | {"loss": -1.0}) + '\n{"step": ' + str(reached + 2))
 
-    run = launch("--resume", *arguments)
+    run = launch("xdualnet", "--resume", *arguments)
     assert run.returncode == 0, run.stderr
     ours, theirs = load_file(folder / "model.safetensors"), load_file(whole / "model.safetensors")
     assert ours.keys() == theirs.keys()
@@ -241,7 +226,12 @@ def test_an_interrupted_run_saves_the_step_it_was_in(tmp_path: Path) -> None:
     folder = tmp_path / "interrupted"
     arguments = ("--out", tmp_path, "--name", "interrupted", "--steps", 400, *TINY, "--save-every", 400)
     with subprocess.Popen(
-        command(*arguments), cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        command("xdualnet", *arguments),
+        cwd=ROOT,
+        env=environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         deadline = time.monotonic() + 120
         while not (folder / "log.jsonl").exists() or not (folder / "log.jsonl").read_text().count("\n"):
@@ -257,12 +247,12 @@ def test_an_interrupted_run_saves_the_step_it_was_in(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("preset", ["tiny", "paper"])
-def test_the_recorded_configuration_is_the_one_resumed(recipe: ModuleType, preset: str) -> None:
-    begun = replace(recipe.PRESETS[preset], steps=77, seed=5, batch=3, arap_from=1.0, supervised=True)
+def test_the_recorded_configuration_is_the_one_resumed(recipe: ModuleType, setup: ModuleType, preset: str) -> None:
+    begun = replace(recipe.PRESETS[preset], steps=77, seed=5, batch=3, arap_from=1.0, corr=False, data="animals")
     recorded = json.loads(json.dumps(asdict(begun), default=str))
     asked = replace(recipe.PRESETS["tiny"], name="other", out=Path("else"), resume=True, threads=1)
     expected = replace(begun, name="other", out=Path("else"), resume=True, threads=1)
-    assert recipe.resumed(asked, recorded) == expected
+    assert setup.resumed(asked, recorded) == expected
 
 
 def test_an_existing_run_is_not_overwritten(whole: Path, refuse: Any) -> None:
@@ -284,10 +274,10 @@ def test_a_damaged_file_is_named(copied: Path, refuse: Any, name: str, damage: s
 def test_a_pool_of_another_configuration_is_not_reused(recipe: ModuleType, tmp_path: Path) -> None:
     """A run killed before its first checkpoint may be begun anew with other values."""
     cfg = replace(recipe.PRESETS["tiny"], pool=3, eval_pairs=1)
-    run = recipe.Run(tmp_path, resume=False)
-    recipe.data(cfg, run, workers=1)
+    data, run = recipe_module("_data").data, recipe_module("_run").Run(tmp_path, resume=False)
+    data(cfg, run, workers=1)
     model = replace(cfg.model, num_signatures=4)
-    pairs, _ = recipe.data(replace(cfg, seed=1, model=model), recipe.Run(tmp_path, resume=False), workers=1)
+    pairs, _ = data(replace(cfg, seed=1, model=model), run, workers=1)
     split = human_split()
     fresh = MeshPool.build(
         load_humans(), split.train_identities, split.train_poses, 3, num_signatures=4, num_eigenpairs=5, seed=1
@@ -311,10 +301,10 @@ def test_divergence_is_told_in_one_line(diverging: list[Any], refuse: Any) -> No
 
 
 def test_advice_on_divergence_works(
-    recipe: ModuleType, copied: Path, diverging: list[Any], monkeypatch: pytest.MonkeyPatch
+    recipe: ModuleType, setup: ModuleType, copied: Path, diverging: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["xdualnet.py", *map(str, diverging)])
-    with pytest.raises(recipe.UserError) as caught:
+    with pytest.raises(setup.UserError) as caught:
         recipe.main()
     advice = str(caught.value)
     if "checkpoint is sound" in advice:
@@ -322,44 +312,29 @@ def test_advice_on_divergence_works(
         assert all(value.abs().max() < 1e6 for value in state["model"].values())
     if "resume" in advice and "--lr" in advice:
         asked = replace(recipe.PRESETS["tiny"], lr=1e-5, resume=True)
-        assert recipe.resumed(asked, read_json(copied / "config.json")).lr == 1e-5
+        assert setup.resumed(asked, read_json(copied / "config.json")).lr == 1e-5
 
 
-def test_measuring_the_speed_leaves_no_trace(recipe: ModuleType, small: Any) -> None:
+def test_measuring_the_speed_leaves_no_trace(recipe: ModuleType, loop: ModuleType, small: Any) -> None:
     cfg, _ = small
     cfg = replace(cfg, minutes=2.0, warmup=0)
     split = human_split()
     pairs = PosePairs(load_humans(), split.train_identities, split.train_poses, length=20)
-    fabric = recipe.Fabric(accelerator="cpu", devices=1)
+    fabric = Fabric(accelerator="cpu", devices=1)
     generator, system = recipe.build(cfg)
     system, optimizer = fabric.setup(system, torch.optim.Adam(generator.parameters()))
     weights = {name: value.clone() for name, value in generator.state_dict().items()}
-    loader = recipe.pair_loader(pairs, recipe.PairSampler(20, 2, stop=5))
-    steps = recipe.count_steps(cfg, fabric, system, optimizer, loader)
+    loader = pair_loader(pairs, PairSampler(20, 2, stop=5))
+    trainer = loop.Trainer(fabric, system, optimizer, cfg, recipe.step, 0)
+    steps = loop.count_steps(trainer, loader)
     assert 10 < steps < 1_000_000
     assert all(torch.equal(value, weights[name]) for name, value in generator.state_dict().items())
     assert optimizer.state_dict()["state"] == {}
-    assert recipe.count_steps(replace(cfg, steps=7), fabric, system, optimizer, loader) == 7
+    trainer.cfg = replace(cfg, steps=7)
+    assert loop.count_steps(trainer, loader) == 7
 
 
 # Other ways to run
-
-
-def test_supervised_training_for_a_time_without_descriptors(tmp_path: Path) -> None:
-    without_descriptors = ("--model.descriptors", "none", "--model.condition", "features")
-    run = launch("--out", tmp_path, "--name", "s", "--supervised", "--minutes", 0.02, *TINY, *without_descriptors)
-    assert run.returncode == 0, run.stderr
-    steps = read_json(tmp_path / "s" / "config.json")["steps"]
-    assert steps >= 1
-    records = read_log(tmp_path / "s")
-    assert [record["step"] for record in records] == list(range(1, steps + 1))
-    assert set(records[0]) - {"step", "seconds", "eval"} == {"rec", "edge", "loss"}
-    summary = read_json(tmp_path / "s" / "summary.json")
-    assert (summary["steps"], summary["pairs_seen"]) == (steps, steps * BATCH)
-    # Within a factor of the speed measured at the start; machines are not that steady.
-    assert records[-1]["seconds"] < 10 * 0.02 * 60
-    assert not list((tmp_path / "s").glob("pool_*"))
-    assert load_generator(tmp_path / "s")[1].descriptors == "none"
 
 
 @pytest.fixture(scope="module")
@@ -383,7 +358,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_pose_transfer_between_files_of_different_sizes(whole: Path, files: Path, tmp_path: Path) -> None:
     result = tmp_path / "new" / "posed.obj"
     pair = (files / "identity.obj", files / "pose.ply")
-    run = launch("--out", whole.parent, "--name", whole.name, "--apply", *pair, "--result", result)
+    run = launch("xdualnet", "--out", whole.parent, "--name", whole.name, "--apply", *pair, "--result", result)
     assert run.returncode == 0, run.stderr
     verts, faces = load_mesh(result)
     assert verts.shape == (2000, 3)
@@ -438,6 +413,7 @@ def test_meshes_in_other_units_or_axes_are_spoken_of(whole: Path, files: Path, t
     verts = verts * (1.7 / (verts.amax(0) - verts.amin(0))[2])
     save_mesh(tmp_path / "odd.obj", change(verts), faces)
     run = launch(
+        "xdualnet",
         *("--out", whole.parent, "--name", whole.name, "--result", tmp_path / "posed.obj"),
         *("--apply", files / "identity.obj", tmp_path / "odd.obj"),
     )
@@ -465,7 +441,7 @@ def test_transfer_without_weights_or_a_place_to_write(
 def test_an_unwritable_folder_ends_with_one_line(tmp_path: Path) -> None:
     """A folder below a file: nobody can write there, not even root."""
     (tmp_path / "file").write_text("in the way")
-    run = launch("--out", tmp_path / "file" / "runs", "--steps", 1, *TINY)
+    run = launch("xdualnet", "--out", tmp_path / "file" / "runs", "--steps", 1, *TINY)
     assert run.returncode == 2
     assert run.stderr.startswith(f"error: cannot write to {tmp_path / 'file' / 'runs'}")
     assert "--out" in run.stderr
@@ -507,9 +483,9 @@ def test_help_gives_the_paper_values(
         recipe.main()
     assert not caught.value.code
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for said in ("Paper: 6890", "Paper: 1e-4", "Paper: 2000", "Paper: 200 epochs of 1600", "Paper: 50", "Paper: 0.1"):
+    for said in ("6890 and 3889", "Paper: 1e-4", "Paper: 2000", "Paper: 200 epochs of 1600", "Paper: 50", "Paper: 0.1"):
         assert said in text, said
-    for flag in ("--resume", "--apply", "--supervised", "--preset", "--minutes", "--model.widths"):
+    for flag in ("--resume", "--apply", "--data", "--no-arap", "--no-corr", "--preset", "--minutes", "--model.widths"):
         assert flag in text
 
 
@@ -523,28 +499,28 @@ def test_paper_preset_is_the_printed_setting(recipe: ModuleType, monkeypatch: py
     assert (cfg.lambda_rec, cfg.lambda_corr, cfg.lambda_edge) == (2000, 200, 1)
     assert (cfg.arap_from, cfg.arap_fraction, cfg.arap_iters, cfg.arap_energy) == (0.75, 0.1, 50, "spokes")
     assert (cfg.lr, cfg.warmup, cfg.decay_from) == (1e-4, 0, 0.5)
-    assert (cfg.resample, cfg.eval_pairs, cfg.supervised) == (False, 400, False)
+    assert (cfg.resample, cfg.eval_pairs, cfg.arap, cfg.corr) == (False, 400, True, True)
     # The command line gives the same, and single values can be changed.
     parsed = []
-    monkeypatch.setattr(recipe, "train", parsed.append)
+    monkeypatch.setattr(recipe, "train", lambda cfg, build, step: parsed.append(cfg))
     for arguments in (["--preset", "paper"], ["--preset=paper"], ["--batch", "6", "--preset", "paper"], []):
         monkeypatch.setattr(sys, "argv", ["xdualnet.py", *arguments])
         recipe.main()
     assert parsed == [cfg, cfg, replace(cfg, batch=6), recipe.PRESETS["tiny"]]
 
 
-def test_learning_rate_schedule(recipe: ModuleType) -> None:
+def test_learning_rate_schedule(recipe: ModuleType, loop: ModuleType) -> None:
     paper, steps = recipe.PRESETS["paper"], 320_000
     for epoch in range(200):  # flat for 100 epochs, then 1e-6 less each epoch
         expected = 1e-4 if epoch <= 100 else 1e-4 - 1e-6 * (epoch - 100)
-        assert recipe.learning_rate(paper, 1600 * epoch, steps) == pytest.approx(expected)
+        assert loop.learning_rate(paper, 1600 * epoch, steps) == pytest.approx(expected)
     tiny = replace(paper, warmup=50, lr=1e-3)
-    rates = [recipe.learning_rate(tiny, s, 1000) for s in range(1000)]
+    rates = [loop.learning_rate(tiny, s, 1000) for s in range(1000)]
     assert rates[0] == pytest.approx(1e-3 / 50)
     assert rates[:50] == pytest.approx([1e-3 * (s + 1) / 50 for s in range(50)])
     assert rates[50:500] == pytest.approx([1e-3] * 450)
     assert rates[-1] == pytest.approx(1e-3 * 2 / 1000)
-    assert recipe.learning_rate(replace(tiny, decay_from=1.0), 999, 1000) == pytest.approx(1e-3)
+    assert loop.learning_rate(replace(tiny, decay_from=1.0), 999, 1000) == pytest.approx(1e-3)
 
 
 @pytest.fixture
@@ -556,11 +532,11 @@ def small(recipe: ModuleType) -> Any:
     return cfg, PosePairs(load_humans(), split.train_identities, split.train_poses)[[(0, 0), (0, 1)]]
 
 
-def run_step(recipe: ModuleType, cfg: Any, batch: Any, *, arap: bool = False) -> dict[str, float]:
+def run_step(recipe: ModuleType, cfg: Any, batch: Any, *, progress: float = 0.0) -> dict[str, float]:
     torch.manual_seed(0)
     _, system = recipe.build(cfg)
     torch.manual_seed(1)
-    return {name: float(value.detach()) for name, value in recipe.step(system, batch, cfg, arap=arap).items()}
+    return {name: float(value.detach()) for name, value in recipe.step(system, batch, cfg, progress).items()}
 
 
 def test_weights_scale_their_losses(recipe: ModuleType, small: Any) -> None:
@@ -575,24 +551,35 @@ def test_weights_scale_their_losses(recipe: ModuleType, small: Any) -> None:
 
 def test_deformer_changes_the_reconstructions_only(recipe: ModuleType, small: Any) -> None:
     cfg, batch = small
-    without, joined = run_step(recipe, cfg, batch), run_step(recipe, cfg, batch, arap=True)
+    without, joined = run_step(recipe, cfg, batch), run_step(recipe, cfg, batch, progress=0.75)
     assert joined["rec_a"] != pytest.approx(without["rec_a"], rel=1e-6)
     assert joined["edge"] == pytest.approx(without["edge"], rel=1e-5)  # it acts on the output before the deformer
 
 
-@pytest.mark.parametrize("edge", ["ratio", "length"])
-def test_supervised_losses_compare_with_the_truth(recipe: ModuleType, small: Any, edge: str) -> None:
+def test_deformer_joins_at_its_share_of_the_run(recipe: ModuleType, small: Any) -> None:
     cfg, batch = small
-    cfg = replace(cfg, supervised=True, edge=edge)
+    without = run_step(recipe, cfg, batch)
+    assert run_step(recipe, cfg, batch, progress=0.74) == without
+    assert run_step(recipe, replace(cfg, arap_from=0.5), batch, progress=0.5) != without
+    assert run_step(recipe, replace(cfg, arap=False), batch, progress=0.99) == without
+
+
+def test_without_backward_correspondence(recipe: ModuleType, small: Any) -> None:
+    cfg, batch = small
     losses = run_step(recipe, cfg, batch)
+    del losses["corr"]
+    assert run_step(recipe, replace(cfg, corr=False), batch) == losses
+
+
+def test_edge_lengths_as_the_paper_prints_them(recipe: ModuleType, small: Any) -> None:
+    cfg, batch = small
+    losses = run_step(recipe, replace(cfg, edge="length"), batch)
     torch.manual_seed(0)
-    generator, _ = recipe.build(cfg)
+    _, system = recipe.build(cfg)
     torch.manual_seed(1)
-    output = generator(batch.identity, batch.pose).vertices.detach()
-    expected = cfg.lambda_rec * (output - batch.ground_truth).double().square().mean((1, 2)).mean()
-    assert losses["rec"] == pytest.approx(float(expected), rel=1e-4)
-    if edge == "ratio":
-        penalty = edge_ratio_loss(output, batch.identity, batch.identity_faces)
-    else:
-        penalty = edge_length_loss(output, batch.identity_faces, reduction="sum")
-    assert losses["edge"] == pytest.approx(cfg.lambda_edge * float(penalty), rel=1e-4)
+    output = system(batch.identity, batch.pose, use_deform=False).output.detach()
+    faces = batch.identity_faces
+    corners = output[torch.arange(len(faces))[:, None, None], faces].double()
+    # Over vertices and their neighbours, so over edges in both directions; each edge belongs to two faces of three.
+    lengths = (corners - corners.roll(1, 2)).square().sum((1, 2, 3))
+    assert losses["edge"] == pytest.approx(cfg.lambda_edge * float(lengths.mean()), rel=1e-4)

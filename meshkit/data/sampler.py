@@ -26,6 +26,8 @@ class PairSampler(Sampler[list[tuple[int, int]]]):
         seed: of the orders.
         rank: of this process; processes take disjoint parts of each epoch.
         world_size: number of processes.
+        shuffle: ``False`` visits the pairs of an epoch in sequence, for pairs that are drawn at random anyway and
+            streamed (:class:`~meshkit.data.MeshPairs` with a window).
 
     Raises:
         ValueError: an epoch holds less than one batch per process, or the sizes make no sense.
@@ -41,6 +43,7 @@ class PairSampler(Sampler[list[tuple[int, int]]]):
         seed: int = 0,
         rank: int = 0,
         world_size: int = 1,
+        shuffle: bool = True,
     ) -> None:
         if batch_size < 1 or not 0 <= rank < world_size:
             raise ValueError(f"need a batch and 0 <= rank < world_size, got {batch_size}, {rank} and {world_size}")
@@ -50,16 +53,16 @@ class PairSampler(Sampler[list[tuple[int, int]]]):
                 f"an epoch of {length} pairs is less than one batch of {batch_size} for each of {world_size} processes"
             )
         self.length, self.batch_size, self.start, self.stop = length, batch_size, start, stop
-        self.seed, self.rank, self.world_size = seed, rank, world_size
+        self.seed, self.rank, self.world_size, self.shuffle = seed, rank, world_size, shuffle
 
     def __len__(self) -> int:
         return max(0, self.stop - self.start)
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        current, order = -1, torch.empty(0)
+        current, order = -1, torch.arange(self.length)
         for step in range(self.start, self.stop):
             epoch, place = divmod(step, self.steps_per_epoch)
-            if epoch != current:
+            if self.shuffle and epoch != current:
                 current, order = (
                     epoch,
                     torch.randperm(self.length, generator=seeded(torch.Generator(), self.seed + 2, epoch, 0)),

@@ -103,6 +103,7 @@ def arap_deform(
         The released code deforms without recording a gradient, which is ``grad="none"``.
 
     Example:
+        >>> import torch
         >>> verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         >>> faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
         >>> moved, info = arap_deform(verts, faces, torch.tensor([0, 1, 2]), verts[:3] + 1.0)

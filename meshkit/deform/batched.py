@@ -156,7 +156,8 @@ def csr(rows: Tensor, cols: Tensor, values: Tensor, shape: tuple[int, int]) -> T
     pointers = torch.searchsorted(rows, torch.arange(shape[0] + 1, device=rows.device))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta state")
-        return torch.sparse_csr_tensor(pointers, cols, values, size=shape, check_invariants=False)
+        place = values.device
+        return torch.sparse_csr_tensor(pointers, cols, values, size=shape, device=place, check_invariants=False)
 
 
 def _summed(rows: Tensor, cols: Tensor, values: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:

@@ -53,6 +53,10 @@ class BatchedProblem:
         self.bad.append(~torch.isfinite(values).all(-1) & self.mask)
         return torch.where(self.mask[..., None], values - self.energy.origin, 0.0)
 
+    def refused(self) -> bool:
+        """Whether any test failed so far; waits for the device."""
+        return bool(torch.cat([flags.flatten() for flags in self.bad]).any())
+
     def handles(self, handles: Tensor) -> tuple[Tensor, Tensor] | None:
         """Which vertices (B, V) are handles, and indices (B, H) with V for what is none; None for a wrong shape."""
         dims = (1, 2) if len(self.shape) == 3 else (1,)
@@ -127,7 +131,7 @@ class BatchedProblem:
             self.bad.append(self.mask & ~(torch.isfinite(soft_weights) & (soft_weights >= 0)))
         if not held:
             self.bad.append(self._loose(fixed if soft is None else fixed | (soft > 0)))
-        if bool(torch.cat([flags.flatten() for flags in self.bad]).any()):
+        if self.refused():
             return None
         with torch.set_grad_enabled(torch.is_grad_enabled() and options.grad != "none"):
             factor = BatchedFactor(energy, self.mask & ~fixed, soft, options.solver)

@@ -14,7 +14,7 @@ from meshkit.deform.batched_factor import BatchedFactor
 
 __all__ = ["BatchedObjective", "BatchedOutcome", "alternate_batch", "minimise_batch"]
 
-_MEMORY, _HALVINGS, _SUFFICIENT = 5, 8, 2e-4
+_MEMORY, _HALVINGS, _SUFFICIENT, _LONGEST = 5, 8, 2e-4, 4.0
 _LOOK = 8  # evaluations between two looks at what is done
 
 
@@ -37,6 +37,7 @@ class BatchedObjective:
         self.factor, self.energy = factor, factor.energy
         self.free, self.solve = factor.free, factor.solve
         rest = self.energy.rest.flatten(0, 1)
+        self.image = rest  # of the last evaluation: (L + W) x
         self.force_at_rest = factor.stiffness @ rest
         self.pull: Tensor | None = None
         if factor.soft is not None and soft_targets is not None:
@@ -56,9 +57,9 @@ class BatchedObjective:
         force = self.energy.pulled_back(self.energy.rotations(x))
         if self.pull is not None:
             force = force + self.pull.detach()
-        image = self.factor.stiffness @ x
-        energy = self.energy.per_mesh(x * (image - 2 * force)) + self.constant
-        return energy, torch.where(self.free, image - force, 0.0)
+        self.image = self.factor.stiffness @ x
+        energy = self.energy.per_mesh(x * (self.image - 2 * force)) + self.constant
+        return energy, torch.where(self.free, self.image - force, 0.0)
 
     def relative(self, decrease: Tensor, energy: Tensor) -> Tensor:
         """A decrease over the energy; see `Objective.relative`."""
@@ -124,10 +125,11 @@ def minimise_batch(objective: BatchedObjective, x: Tensor, *, max_iter: int, tol
     slack = 1e-13 * objective.constant.abs()
     moves, changes = (x.new_zeros(_MEMORY, *x.shape) for _ in range(2))
     inverses = energy.new_zeros(_MEMORY, len(energy))  # 0 marks an empty place
+    image, stretch = objective.image, torch.ones_like(energy)
     step, halvings = torch.ones_like(energy), torch.zeros_like(evaluations)
     stuck = negative = torch.zeros_like(energy, dtype=torch.bool)
     for evaluation in range(1, max_iter + 1):
-        direction = _two_loops(objective, moves, changes, inverses, gradient)
+        direction = _two_loops(objective, moves, changes, inverses, gradient, stretch)
         decrease = per_mesh(gradient * direction)
         residual = objective.relative(decrease, energy)
         done = (residual <= tol) | stuck
@@ -147,6 +149,10 @@ def minimise_batch(objective: BatchedObjective, x: Tensor, *, max_iter: int, tol
         newest = torch.where(bent, 1 / torch.where(bent, curvature, 1.0), 0.0)
         shifted = torch.cat([torch.where(bent, inverses[1:], 0.0), newest[None]])
         inverses = torch.where(accepted, shifted, inverses)
+        # As in `minimise`; 1 after negative curvature, where `newest` is 0.
+        longer = (per_mesh(move * (objective.image - image)) * newest).clamp(1.0, _LONGEST)
+        stretch = torch.where(accepted, longer, stretch)
+        image = torch.where(taken, objective.image, image)
         x = torch.where(taken, x + move, x)
         gradient = torch.where(taken, new_gradient, gradient)
         energy = torch.where(accepted, new_energy, energy)
@@ -154,7 +160,7 @@ def minimise_batch(objective: BatchedObjective, x: Tensor, *, max_iter: int, tol
         halvings = torch.where(accepted, 0, halvings + 1)
         failed = ~done & (halvings >= _HALVINGS)
         stuck = stuck | (failed & (inverses == 0).all(0))
-        inverses = torch.where(failed, 0.0, inverses)
+        inverses, stretch = torch.where(failed, 0.0, inverses), torch.where(failed, 1.0, stretch)
         step = torch.where(accepted | failed, 1.0, 0.5 * step)
         halvings = torch.where(failed, 0, halvings)
     converged = residual <= tol
@@ -162,7 +168,7 @@ def minimise_batch(objective: BatchedObjective, x: Tensor, *, max_iter: int, tol
 
 
 def _two_loops(
-    objective: BatchedObjective, moves: Tensor, changes: Tensor, inverses: Tensor, gradient: Tensor
+    objective: BatchedObjective, moves: Tensor, changes: Tensor, inverses: Tensor, gradient: Tensor, stretch: Tensor
 ) -> Tensor:
     """The L-BFGS inverse Hessian applied to a gradient."""
     per_mesh, spread = objective.energy.per_mesh, objective.spread
@@ -170,7 +176,7 @@ def _two_loops(
     for move, change, inverse in zip(moves.flip(0), changes.flip(0), inverses.flip(0), strict=True):
         shares.append(inverse * per_mesh(move * right))
         right = right - spread(shares[-1]) * change
-    direction = objective.solve(right)
+    direction = spread(stretch) * objective.solve(right)
     for move, change, inverse, share in zip(moves, changes, inverses, reversed(shares), strict=True):
         direction = direction + spread(share - inverse * per_mesh(change * direction)) * move
     return direction

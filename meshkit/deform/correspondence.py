@@ -99,10 +99,10 @@ def key_point_correspondence(
     floor = 1e-12 * (source.amax(0) - source.amin(0)).square().sum()
     weights = facing / (squared + floor)
     weights = weights / weights.sum(1, keepdim=True)
-    rows = torch.arange(len(target))[:, None].expand_as(near)
+    rows = torch.arange(len(target), device="cpu")[:, None].expand_as(near)
     index = torch.stack([rows.flatten(), near.flatten()])
     size = (len(target), len(source))
-    return torch.sparse_coo_tensor(index, weights.flatten(), size, check_invariants=False).coalesce()
+    return torch.sparse_coo_tensor(index, weights.flatten(), size, device="cpu", check_invariants=False).coalesce()
 
 
 def check_points(points: Tensor, name: str, *, batched: bool = False) -> None:
@@ -134,10 +134,10 @@ def _spline(knots: Tensor, values: Tensor, points: Tensor, smoothing: float) -> 
     spread = torch.linalg.svdvals(knots - knots.mean(0))
     if spread[2] <= 1e-9 * spread[0]:
         raise ValueError("the key points of the target lie in one plane, which fixes no map of space; add one off it")
-    affine = torch.cat([knots, torch.ones(count, 1, dtype=torch.float64)], 1)
-    system = torch.zeros(count + 4, count + 4, dtype=torch.float64)
+    affine = torch.cat([knots, knots.new_ones(count, 1)], 1)
+    system = knots.new_zeros(count + 4, count + 4)
     # -r is conditionally positive definite
-    system[:count, :count] = -torch.cdist(knots, knots) + smoothing * torch.eye(count, dtype=torch.float64)
+    system[:count, :count] = -torch.cdist(knots, knots) + smoothing * torch.diag(knots.new_ones(count))
     system[:count, count:], system[count:, :count] = affine, affine.T
     solved = torch.linalg.solve(system, torch.cat([values, values.new_zeros(4, 3)]))
     basis = torch.cat([-torch.cdist(points, knots), points, points.new_ones(len(points), 1)], 1)

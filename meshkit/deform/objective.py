@@ -13,6 +13,7 @@ from meshkit.deform.tracker import RotationTracker
 __all__ = ["Objective", "Outcome", "minimise"]
 
 _MEMORY, _HALVINGS, _SUFFICIENT = 5, 8, 2e-4
+_LONGEST = 4.0  # times the step of local-global
 
 
 @dataclass
@@ -40,6 +41,7 @@ class Objective:
         self.factor, self.rest, self.dtype = factor, factor.rest, dtype
         self.tracker = RotationTracker(compiled=compiled)
         self.evaluations = 0
+        self.image = torch.empty(0, device="cpu")  # of the last evaluation: free rows of (L + W) x
         topology = self.rest.topology
         self.constant = self.rest.rest_energy / topology.multiplicity
         # Rotations ignore scale: bring the matrices near 1, where float32 has room.
@@ -85,7 +87,8 @@ class Objective:
             force += self.pull
         image = self.stiffness @ x
         energy = dot(x, torch.sub(image, force, alpha=2)) + self.constant
-        return energy, image.sub_(force).index_select(0, self.factor.free)
+        self.image = image.index_select(0, self.factor.free)
+        return energy, self.image - force.index_select(0, self.factor.free)
 
     def global_step(self, x: Tensor) -> Tensor:
         """Positions that minimise the energy while every rotation is the identity."""
@@ -108,6 +111,9 @@ class Objective:
 def minimise(objective: Objective, x: Tensor, *, max_iter: int, tol: float, refine: bool) -> Outcome:
     """L-BFGS whose metric is the factored stiffness, so that its first step is one of local-global.
 
+    The turning of the rotations makes the energy flatter than its stiffness L says. By how much, the last step s and
+    change y of the gradient tell: the metric is L over s^T L s / s^T y, at least 1.
+
     Args:
         objective: what to minimise.
         x: (V, 3) positions that meet the handles.
@@ -117,16 +123,18 @@ def minimise(objective: Objective, x: Tensor, *, max_iter: int, tol: float, refi
     """
     history: list[tuple[Tensor, Tensor, float]] = []
     energy, gradient = objective(x)
+    image, stretch = objective.image, 1.0
     slack = 1e-13 * abs(objective.constant)
     negative = False
     while True:
-        direction = _two_loops(objective, history, gradient)
+        direction = _two_loops(objective, history, gradient, stretch)
         decrease = dot(gradient, direction)
         # Without a history this is g^T L^-1 g; with one it knows the curvature too, and is mostly larger.
         residual = objective.relative(decrease, energy)
         if refine and tol < 1e-7 and objective.dtype == torch.float32 and residual <= 1e-7:
             energy, gradient = _in_float64(objective, x)
             history.clear()
+            image, stretch = objective.image, 1.0
             continue
         if residual <= tol or objective.evaluations >= max_iter:
             break
@@ -143,17 +151,21 @@ def minimise(objective: Objective, x: Tensor, *, max_iter: int, tol: float, refi
                 history.clear()
             elif refine and objective.dtype == torch.float32:
                 energy, gradient = _in_float64(objective, x)
+                image = objective.image
             else:
                 break
+            stretch = 1.0
             continue
         move, change = direction.mul_(-step), new_gradient - gradient
         curvature = dot(move, change)
         negative = curvature < 0
         if curvature > 0:
             history = [*history[1 - _MEMORY :], (move, change, 1 / curvature)]
+            stretch = min(max(dot(move, objective.image - image) / curvature, 1.0), _LONGEST)
         else:
             history.clear()
-        x, energy, gradient = candidate, new_energy, new_gradient
+            stretch = 1.0
+        x, energy, gradient, image = candidate, new_energy, new_gradient, objective.image
     converged = residual <= tol
     if history:
         residual = objective.residual(energy, gradient)
@@ -166,13 +178,15 @@ def _in_float64(objective: Objective, x: Tensor) -> tuple[float, Tensor]:
     return objective(x)
 
 
-def _two_loops(objective: Objective, history: list[tuple[Tensor, Tensor, float]], gradient: Tensor) -> Tensor:
+def _two_loops(
+    objective: Objective, history: list[tuple[Tensor, Tensor, float]], gradient: Tensor, stretch: float
+) -> Tensor:
     """The L-BFGS inverse Hessian applied to a gradient."""
     right, shares = gradient.clone(), []
     for move, change, inverse in reversed(history):
         shares.append(inverse * dot(move, right))
         right.sub_(change, alpha=shares[-1])
-    direction = objective.solve(right)
+    direction = objective.solve(right).mul_(stretch)
     for (move, change, inverse), share in zip(history, reversed(shares), strict=True):
         direction.add_(move, alpha=share - inverse * dot(change, direction))
     return direction

@@ -16,10 +16,14 @@ from meshkit.models.ordered import OrderedPoseTransferStack
 from meshkit.models.output import GeneratorOutput
 from meshkit.models.pointwise import PointwiseExtractor
 from meshkit.models.stack import PoseTransferStack
+from meshkit.models.symmetry import mirror_labels
 from meshkit.nn import SetConvExtractor
+from meshkit.norm import ConditionalNorm, ElaIN, SPAdaIN
 from meshkit.ot import TransportPlan, sinkhorn
 
 __all__ = ["GeneratorOutput", "PoseTransferGenerator"]
+
+_NORMS: dict[str, type[ConditionalNorm]] = {"elain": ElaIN, "spadain": SPAdaIN}
 
 
 class PoseTransferGenerator(nn.Module):
@@ -46,6 +50,8 @@ class PoseTransferGenerator(nn.Module):
             reconstruction rebuilds B from B, the blocks can copy it, and never learn to transfer a shape.
         eps: entropic regularisation of the matching.
         n_iters: Sinkhorn iterations.
+        norm: conditional norm of the blocks, ``"elain"`` or, for the paper's ablation, ``"spadain"``
+            (:class:`~meshkit.norm.SPAdaIN`), which takes scale and shift from the condition alone.
         spectral: spectral normalisation in the blocks.
         residual: the output is the warped mesh plus a learned displacement.
         rigid_radius: if given, the warped mesh passes through
@@ -58,6 +64,10 @@ class PoseTransferGenerator(nn.Module):
             of the pose mesh's body.
         normalize_plan: warp with the row-normalised plan (released code). ``False`` warps with the raw plan as the
             paper prints it, whose rows sum to 1/N, so that the warped mesh is N times too small.
+        symmetry: in evaluation, given ``identity_faces``, look at the identity mesh's mirror image too, and let
+            :func:`~meshkit.models.symmetry.mirror_labels` choose for each vertex which of the two it is matched as.
+            Limbs that are exchanged by a mistaken matching are put right where they would be torn. Takes bodies
+            whose left and right lie along x.
         released: the released code to the letter: its first convolution
             (:class:`~meshkit.models.OrderedPoseTransferStack`), and the 1e-8 that it adds to the denominators of the
             matching. For checkpoints of that code; see :func:`~meshkit.models.load_released_checkpoint`.
@@ -89,11 +99,13 @@ class PoseTransferGenerator(nn.Module):
         widths: Sequence[int] = (1024, 512, 256),
         eps: float = 0.03,
         n_iters: int = 5,
+        norm: str = "elain",
         spectral: bool = True,
         residual: bool = False,
         condition: str = "features",
         rigid_radius: float | None = None,
         match_size: bool = False,
+        symmetry: bool = False,
         normalize_plan: bool = True,
         released: bool = False,
     ) -> None:
@@ -106,10 +118,13 @@ class PoseTransferGenerator(nn.Module):
             raise ValueError(f'extractor must be "setconv" or "pointwise", got {extractor!r}')
         if condition not in ("features", "descriptors"):
             raise ValueError(f'condition must be "features" or "descriptors", got {condition!r}')
+        if norm not in _NORMS:
+            raise ValueError(f'norm must be "elain" or "spadain", got {norm!r}')
         if (condition == "descriptors" or match_size) and descriptors == 0:
             raise ValueError('condition="descriptors" and match_size need descriptors: give their number of channels')
         self.eps, self.n_iters, self.normalize_plan = eps, n_iters, normalize_plan
         self.condition, self.rigid_radius, self.match_size = condition, rigid_radius, match_size
+        self.symmetry = symmetry
         features = extractor_widths[-1]
         self.extractor: SetConvExtractor | PointwiseExtractor
         if extractor == "setconv":
@@ -122,7 +137,7 @@ class PoseTransferGenerator(nn.Module):
         stack = OrderedPoseTransferStack if released else PoseTransferStack
         self.released = released
         cond_features = features if condition == "features" else descriptors
-        self.transfer = stack(cond_features, widths, spectral=spectral, residual=residual)
+        self.transfer = stack(cond_features, widths, norm=_NORMS[norm], spectral=spectral, residual=residual)
         self.register_buffer("descriptor_mean", torch.zeros(descriptors))
         self.register_buffer("descriptor_std", torch.ones(descriptors))
         self.reset_parameters()
@@ -181,6 +196,40 @@ class PoseTransferGenerator(nn.Module):
         floor = STABILIZER if isinstance(self.extractor, SetConvExtractor) else 0.0
         return stabilized_matching(*pair, **options, floor=floor)
 
+    def _warp(
+        self, identity: Tensor, pose: Tensor, positions: Tensor, identity_mask: Tensor | None, pose_mask: Tensor | None
+    ) -> tuple[TransportPlan | DensePlan, Tensor]:
+        """The plan between two meshes' features, and the pose mesh's positions carried by it."""
+        plan = self.match(identity, pose, identity_mask=identity_mask, pose_mask=pose_mask)
+        values = positions.to(plan.dtype)
+        return plan, plan.barycentric(values) if self.normalize_plan else plan @ values
+
+    @torch.no_grad()
+    def _handed(
+        self,
+        verts: Tensor,
+        faces: Tensor,
+        descriptors: Tensor | None,
+        features: Tensor,
+        *pair: Any,
+    ) -> Tensor:
+        """Features of the identity mesh, of its mirror image where that is what a vertex is better matched as."""
+        mask = pair[2]
+        mirrored = self.encode(verts * verts.new_tensor([-1.0, 1.0, 1.0]), mask=mask, descriptors=descriptors)
+        targets, others = (self._warp(f, *pair)[1] for f in (features, mirrored))
+        partners = self.match(mirrored, features, identity_mask=mask, pose_mask=mask).argmax()
+        labels = []
+        for b in range(len(verts)):
+            real = slice(None) if mask is None else mask[b].nonzero()[:, 0]
+            own = faces if faces.dim() == 2 else faces[b]
+            mesh = [verts[b, real], own[(own >= 0).all(1)], targets[b, real], others[b, real], partners[b, real]]
+            if mask is not None:
+                place = mask[b].cumsum(0) - 1
+                mesh[1], mesh[4] = place[mesh[1]], place[mesh[4]]
+            labels.append(torch.zeros(verts.shape[1], dtype=torch.bool, device=verts.device))
+            labels[-1][real] = mirror_labels(*mesh)
+        return torch.where(torch.stack(labels)[..., None], mirrored, features)
+
     def forward(
         self,
         identity: Tensor,
@@ -192,8 +241,12 @@ class PoseTransferGenerator(nn.Module):
         pose_descriptors: Tensor | None = None,
         identity_features: Tensor | None = None,
         pose_features: Tensor | None = None,
+        identity_faces: Tensor | None = None,
     ) -> GeneratorOutput:
         """Give the identity mesh the pose of the pose mesh; features are computed unless given.
+
+        ``identity_faces``, ``(F, 3)`` or ``(B, F, 3)`` padded with -1, are looked at if the model has ``symmetry``, in
+        evaluation.
 
         With ``condition="descriptors"``, ``identity_descriptors`` are needed even beside given features.
         """
@@ -203,18 +256,19 @@ class PoseTransferGenerator(nn.Module):
             identity_features = self.encode(identity, mask=identity_mask, descriptors=identity_descriptors)
         if pose_features is None:
             pose_features = self.encode(pose, mask=pose_mask, descriptors=pose_descriptors)
-        plan = self.match(identity_features, pose_features, identity_mask=identity_mask, pose_mask=pose_mask)
         if pose_mask is not None:
             pose = pose.masked_fill(~pose_mask[..., None], 0.0)
-        values = pose.to(plan.dtype)
         if self.match_size:
             if identity_descriptors is None or pose_descriptors is None:
                 raise ValueError("match_size needs identity_descriptors and pose_descriptors, also beside features")
             growth = masked_mean(identity_descriptors[..., -1:], identity_mask) - masked_mean(
                 pose_descriptors[..., -1:], pose_mask
             )
-            values = values * growth.exp()[:, None]
-        warped = plan.barycentric(values) if self.normalize_plan else plan @ values
+            pose = pose * growth.exp()[:, None]
+        pair = (identity_features, pose_features, pose, identity_mask, pose_mask)
+        if self.symmetry and not self.training and identity_faces is not None:
+            pair = (self._handed(identity, identity_faces, identity_descriptors, *pair), *pair[1:])
+        plan, warped = self._warp(*pair)
         standard = None if identity_descriptors is None else self._standardise(identity_descriptors)
         if self.condition == "descriptors" and standard is None:
             raise ValueError('condition="descriptors" needs identity_descriptors, also beside identity_features')

@@ -38,6 +38,8 @@ class GeneratorConfig:
     """Entropic regularisation of the matching. Paper: 0.03."""
     n_iters: int = 5
     """Sinkhorn iterations. Paper: 5."""
+    norm: str = "elain"
+    """Conditional norm of the blocks: elain, or spadain, with which the paper compares it."""
     spectral: bool = True
     """Spectral normalisation in the blocks. Released code: yes."""
     residual: bool = False
@@ -51,6 +53,8 @@ class GeneratorConfig:
     """Radius of the rigid moving least squares that the warped mesh passes through, in metres. Paper: none."""
     match_size: bool = False
     """Scale the pose mesh to the identity's size before warping it, where there are descriptors. Paper: no."""
+    symmetry: bool = False
+    """In evaluation, resolve exchanged limbs with the identity's mirror image (needs faces). Paper: no."""
     descriptors: str = "none"
     """none: coordinates alone, the paper; wks: wave-kernel signatures and the size of the mesh besides."""
     num_signatures: int = 16
@@ -109,6 +113,7 @@ PRESETS = {
         residual=True,
         rigid_radius=0.25,
         match_size=True,
+        symmetry=True,
         descriptors="wks",
     ),
 }

@@ -1,0 +1,245 @@
+"""Meshes of a folder, parsed once and read from memory maps afterwards."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import warnings
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from meshkit.data.layouts import MeshEntry
+from meshkit.io import MeshFileError, atomic_write, load_mesh
+
+__all__ = ["MeshStore"]
+
+_FORMAT = 2
+_OPEN_MAPS = 64
+
+
+class MeshStore:
+    """Meshes in shards of ``.npy`` files, read through memory maps: any number of them, in little memory.
+
+    :meth:`build` parses the files once, with a progress bar, and writes the shards; later calls with the same files
+    (by name, size and time of change) open what is there. Identical face lists are stored once per shard.
+
+    Args:
+        cache: folder that :meth:`build` filled.
+
+    Attributes:
+        entries: the meshes, without files that could not be read.
+        identity: ``(P,)`` identity of each.
+        pose: ``(P,)`` pose of each.
+        num_verts: ``(P,)`` vertex counts.
+        num_faces: ``(P,)`` face counts.
+        center: ``(P, 3)`` float32 middle of the bounding box of each.
+        topology: ``(P,)`` number of the face list: meshes with equal ones are taken to be registered to each other.
+        shard: ``(P,)`` shard that holds each.
+        skipped: names of files that could not be read, with the reason.
+
+    Raises:
+        MeshFileError: no store of this format in the folder, or shards missing.
+
+    Example:
+        >>> import tempfile
+        >>> from meshkit.data import load_humans, scan_pose_transfer
+        >>> from meshkit.io import save_mesh
+        >>> folder, body = Path(tempfile.mkdtemp()), load_humans()
+        >>> for who, how in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        ...     save_mesh(folder / f"{who}_{how}.ply", body(torch.tensor([who]), torch.tensor([how]))[0], body.faces)
+        >>> store = MeshStore.build(scan_pose_transfer(folder), folder / "cache", progress=False)
+        >>> len(store), store.verts(3).shape, store.topology.tolist()
+        (4, torch.Size([1000, 3]), [0, 0, 0, 0])
+    """
+
+    def __init__(self, cache: str | os.PathLike[str]) -> None:
+        self.cache = Path(cache)
+        try:
+            index = json.loads((self.cache / "index.json").read_text())
+            if index["format"] != _FORMAT:
+                raise ValueError(f"format {index['format']}, not {_FORMAT}")
+            rows = np.array(index["rows"], dtype=np.int64).reshape(-1, 8)
+            names, _ = index["paths"], index["centers"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise MeshFileError(f"{self.cache}: no store of meshes in it ({error}); build it") from error
+        missing = [k for k in range(rows[:, 3].max(initial=-1) + 1) if not self._file("verts", k).is_file()]
+        if missing:
+            raise MeshFileError(f"{self._file('verts', missing[0])}: shard is missing; delete {self.cache} and build")
+        self.entries = [
+            MeshEntry(Path(p), int(i), int(q)) for p, i, q in zip(names, rows[:, 0], rows[:, 1], strict=True)
+        ]
+        self.skipped: list[tuple[str, str]] = [(name, reason) for name, reason in index["skipped"]]
+        self.identity, self.pose, self.topology, self.shard = torch.from_numpy(rows[:, :4].T.copy())
+        self._spans = rows[:, 4:]
+        self.num_verts = torch.from_numpy(self._spans[:, 1] - self._spans[:, 0])
+        self.num_faces = torch.from_numpy(self._spans[:, 3] - self._spans[:, 2])
+        self.center = torch.tensor(index["centers"]).view(-1, 3)
+        self._maps: OrderedDict[tuple[str, int], Tensor] = OrderedDict()
+
+    @classmethod
+    def build(
+        cls,
+        entries: Sequence[MeshEntry],
+        cache: str | os.PathLike[str],
+        *,
+        skip_bad: bool = False,
+        progress: bool = True,
+        shard_bytes: int = 64 << 20,
+        max_file_bytes: int = 128 << 20,
+    ) -> MeshStore:
+        """Parse meshes into ``cache``, unless exactly these files are there already, and open the store.
+
+        In memory at a time: one shard, and one file being parsed. Parsing was measured to take 6 to 13 times the size
+        of files from :func:`~meshkit.io.save_mesh`, and 27 times that of a text of single digits: with the defaults,
+        at most 4 GiB, and that only for a file as large as ``max_file_bytes``.
+
+        Args:
+            entries: the meshes, from :func:`~meshkit.data.scan_pose_transfer` and its like, or made by yourself.
+            cache: folder for the shards; made if missing.
+            skip_bad: leave out files that cannot be read, and warn at the end how many, naming the first. They are
+                listed in ``skipped``. Otherwise the first one is an error.
+            progress: show a progress bar.
+            shard_bytes: size to which a shard grows; unit of streaming.
+            max_file_bytes: larger files count as files that cannot be read.
+
+        Raises:
+            MeshFileError: no entries, or none readable; or a file that cannot be read, without ``skip_bad``.
+        """
+        from tqdm import tqdm
+
+        if not entries:
+            raise MeshFileError(f"no meshes to store in {cache}")
+        cache = Path(cache)
+        key = _fingerprint(entries, skip_bad, shard_bytes, max_file_bytes)
+        if _stored_key(cache) == key:
+            return cls(cache)
+        cache.mkdir(parents=True, exist_ok=True)
+        (cache / "index.json").unlink(missing_ok=True)  # without an index, what follows is no store until it is whole
+        for stale in (*cache.glob("verts-*.npy"), *cache.glob("faces-*.npy")):
+            stale.unlink()
+        rows: list[list[int]] = []
+        paths: list[str] = []
+        centers: list[list[float]] = []
+        skipped: list[tuple[str, str]] = []
+        topologies: dict[bytes, int] = {}
+        shard = _Shard(cache, 0)
+        for entry in tqdm(entries, desc="meshes", unit="mesh", disable=not progress, dynamic_ncols=True):
+            try:
+                verts, faces = _read(entry.path, max_file_bytes)
+            except MeshFileError as error:
+                if not skip_bad:
+                    raise
+                skipped.append((str(entry.path), str(error)))
+                continue
+            digest = hashlib.sha256(faces.tobytes() + len(verts).to_bytes(8, "little")).digest()
+            topology = topologies.setdefault(digest, len(topologies))
+            rows.append([entry.identity, entry.pose, topology, shard.number, *shard.add(verts, faces, topology)])
+            paths.append(str(entry.path))
+            centers.append(((verts.min(0) + verts.max(0)) / 2).tolist())
+            if shard.size >= shard_bytes:
+                shard.write()
+                shard = _Shard(cache, shard.number + 1)
+        if not rows:
+            raise MeshFileError(f"none of the {len(entries)} files could be read, the first: {skipped[0][1]}")
+        shard.write()
+        index = {"format": _FORMAT, "key": key, "rows": rows, "paths": paths, "centers": centers, "skipped": skipped}
+        with atomic_write(cache / "index.json") as temporary:
+            temporary.write_text(json.dumps(index))
+        if skipped:
+            message = f"{len(skipped)} of {len(entries)} mesh files were left out, the first: {skipped[0][1]}"
+            warnings.warn(message, stacklevel=2)
+        return cls(cache)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def verts(self, k: int) -> Tensor:
+        """Vertices ``(N, 3)`` float32 of mesh k, in the order of its file."""
+        return self.view("verts", k).clone()
+
+    def faces(self, k: int) -> Tensor:
+        """Faces ``(F, 3)`` int64 of mesh k."""
+        return self.view("faces", k).long()
+
+    def view(self, kind: str, k: int) -> Tensor:
+        """``"verts"`` (float32) or ``"faces"`` (int32) of mesh k, not copied: pages of the file, until written to."""
+        begin, end = self._spans[k, :2] if kind == "verts" else self._spans[k, 2:]
+        return self._map(kind, int(self.shard[k]))[begin:end]
+
+    def _file(self, kind: str, number: int) -> Path:
+        return self.cache / f"{kind}-{number:05d}.npy"
+
+    def _map(self, kind: str, number: int) -> Tensor:
+        """A memory map, of which a limited number are kept open. What is written to it stays private."""
+        if (kind, number) not in self._maps:
+            self._maps[kind, number] = torch.from_numpy(np.load(self._file(kind, number), mmap_mode="c"))
+            if len(self._maps) > _OPEN_MAPS:
+                self._maps.popitem(last=False)
+        self._maps.move_to_end((kind, number))
+        return self._maps[kind, number]
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A pickled memory map would carry its whole content to the worker.
+        return {**self.__dict__, "_maps": OrderedDict()}
+
+
+class _Shard:
+    """What is gathered for one pair of files."""
+
+    def __init__(self, cache: Path, number: int) -> None:
+        self.cache, self.number, self.size = cache, number, 0
+        self.verts: list[np.ndarray] = []
+        self.faces: list[np.ndarray] = []
+        self.ends = [0, 0]
+        self.places: dict[int, tuple[int, int]] = {}
+
+    def add(self, verts: np.ndarray, faces: np.ndarray, topology: int) -> tuple[int, int, int, int]:
+        """First and last row of the vertices and of the faces."""
+        begin = self.ends[0]
+        self.ends[0] += len(verts)
+        self.verts.append(verts)
+        self.size += verts.nbytes
+        if topology not in self.places:
+            self.places[topology] = (self.ends[1], self.ends[1] + len(faces))
+            self.ends[1] += len(faces)
+            self.faces.append(faces)
+            self.size += faces.nbytes
+        return (begin, self.ends[0], *self.places[topology])
+
+    def write(self) -> None:
+        if self.verts:
+            for kind, parts in (("verts", self.verts), ("faces", self.faces)):
+                with atomic_write(self.cache / f"{kind}-{self.number:05d}.npy") as temporary:
+                    np.save(temporary, np.concatenate(parts))
+
+
+def _read(path: Path, max_bytes: int) -> tuple[np.ndarray, np.ndarray]:
+    size = path.stat().st_size if path.is_file() else 0
+    if size > max_bytes:
+        raise MeshFileError(f"{path}: {size:,} bytes, more than the {max_bytes:,} allowed (max_file_bytes)")
+    verts, faces = load_mesh(path)
+    return verts.numpy(), faces.numpy().astype(np.int32)
+
+
+def _fingerprint(entries: Sequence[MeshEntry], *options: object) -> str:
+    """Changes with the files' names, sizes and times, with what they are said to be, and with the options."""
+    total = hashlib.sha256(repr((_FORMAT, options)).encode())
+    for entry in entries:
+        stat = entry.path.stat() if entry.path.is_file() else None
+        known = (0, 0) if stat is None else (stat.st_size, stat.st_mtime_ns)
+        total.update(repr((str(entry.path), entry.identity, entry.pose, known)).encode())
+    return total.hexdigest()
+
+
+def _stored_key(cache: Path) -> str | None:
+    try:
+        return json.loads((cache / "index.json").read_text())["key"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,152 @@
+"""What --data means: training pairs, and test pairs of unseen identities in unseen poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from _run import Run, UserError
+from torch import Tensor
+
+from meshkit.data import (
+    RELEASED_SPLITS,
+    MeshEntry,
+    MeshPairs,
+    MeshPool,
+    MeshStore,
+    PairBatch,
+    PosePairs,
+    RiggedModel,
+    Split,
+    load_shipped,
+    load_smal,
+    load_smpl,
+    scan_faust,
+    scan_mgn,
+    scan_pose_transfer,
+)
+
+KINDS = "humans, animals, smpl:<file>, smal:<file>, faust:<folder>, mgn:<folder> or folder:<folder>"
+SCANNERS = {"faust": scan_faust, "mgn": scan_mgn, "folder": scan_pose_transfer}
+Pairs = PosePairs | MeshPairs
+
+
+def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -> tuple[Pairs, Pairs]:
+    """Training and test pairs of ``--data``; those of rigged bodies are made on ``device``."""
+    kind, _, place = cfg.data.partition(":")
+    if kind not in ("humans", "animals", "smpl", "smal", *SCANNERS) or (kind in ("humans", "animals")) == bool(place):
+        raise UserError(f"--data must be {KINDS}; got {cfg.data!r}")
+    if place and not Path(place).exists():
+        raise UserError(f"--data {cfg.data}: there is no {place}")
+    try:
+        if kind in SCANNERS:
+            return files(cfg, run, SCANNERS[kind](place))
+        body, split = rigged(kind, Path(place)) if place else load_shipped(kind, cfg.vertices)
+    except ValueError as error:
+        raise UserError(f"--data {cfg.data}: {error}") from None
+    train, test = posed(cfg, run, workers, body, split)
+    return train.to(device), test.to(device)
+
+
+def inputs(batch: PairBatch) -> dict[str, Tensor | None]:
+    """What a generator is told beside the vertices."""
+    return {
+        "identity_mask": batch.identity_mask,
+        "pose_mask": batch.pose_mask,
+        "identity_descriptors": batch.identity_descriptors,
+        "pose_descriptors": batch.pose_descriptors,
+    }
+
+
+def rigged(kind: str, file: Path) -> tuple[RiggedModel, Split]:
+    """SMPL or SMAL with tables of identities and poses drawn once, one in five of each kept for testing.
+
+    Shapes are standard normal coefficients, or SMAL's toys where its data file (``..._data.pkl``) lies beside the
+    model. Poses turn each joint but the root by normal angles of 0.2 to 0.3 radians about random axes.
+    """
+    if kind == "smpl":
+        body = load_smpl(file, z_up=True)
+    else:
+        beside = file.with_name(f"{file.stem}_data{file.suffix}")
+        body = load_smal(file, beside if beside.exists() else None)
+    draw = torch.Generator().manual_seed(0)
+    if body.identities is None:
+        body.identities = torch.randn(200, len(body.shape_dirs), generator=draw).clamp(-3, 3)
+    poses = (0.3 if kind == "smpl" else 0.2) * torch.randn(1000, len(body.joints), 3, generator=draw)
+    poses[:, 0] = 0.0
+    body.poses = poses
+    return body, drawn_split(len(body.identities), len(poses), draw)
+
+
+def drawn_split(identities: int, poses: int, draw: torch.Generator) -> Split:
+    who, how = torch.randperm(identities, generator=draw), torch.randperm(poses, generator=draw)
+    a, b = max(1, identities // 5), max(1, poses // 5)
+    rows = [side[torch.randint(len(side), (400,), generator=draw)] for side in (who[:a], how[:b], who[:a], how[:b])]
+    return Split(who[a:].sort()[0], who[:a].sort()[0], how[b:].sort()[0], how[:b].sort()[0], torch.stack(rows, 1))
+
+
+def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, MeshPairs]:
+    """Pairs of meshes from files: the released split where their numbers are those of a released data set."""
+    if cfg.model.descriptors != "none":
+        raise UserError("meshes from files come without signatures: add --model.descriptors none")
+    for name in ("humans", "animals"):
+        train, test = (RELEASED_SPLITS[f"{name}-{side}"].select(entries) for side in ("train", "test"))
+        if len(train) > 1 and len(test) > 1:
+            break
+    else:
+        # One in five identities and poses, at least two of each, to test on: the last ones.
+        people, poses = ({getattr(e, name) for e in entries} for name in ("identity", "pose"))
+        last_people, last_poses = (set(sorted(x)[-max(2, len(x) // 5) :]) for x in (people, poses))
+        train = [e for e in entries if e.identity not in last_people and e.pose not in last_poses]
+        test = [e for e in entries if e.identity in last_people and e.pose in last_poses]
+    stores = []
+    for side, chosen in (("train", train), ("test", test)):
+        if len(chosen) < 2:
+            raise UserError(f"--data {cfg.data}: {len(chosen)} meshes to {side} on are too few, of {len(entries)}")
+        # Every process reads the cache; who comes first has made it.
+        stores.append(MeshStore.build(chosen, run.path(f"cache_{side}"), progress=run.writes))
+    common: dict[str, Any] = {"seed": cfg.seed}
+    train_pairs = MeshPairs(stores[0], length=cfg.pairs, resample=cfg.resample, ground_truth=cfg.ground_truth, **common)
+    return train_pairs, MeshPairs(stores[1], length=cfg.eval_pairs, ground_truth=known(stores[1]), **common)
+
+
+def known(store: MeshStore) -> bool:
+    """Whether two identities share a pose, so that there is a ground truth."""
+    pairs = torch.stack([store.pose, store.identity], 1).unique(dim=0)
+    return bool((pairs[:, 0].unique(return_counts=True)[1] > 1).any())
+
+
+def posed(cfg: Any, run: Run, workers: int, body: RiggedModel, split: Split) -> tuple[PosePairs, PosePairs]:
+    """Pairs of a rigged body, with signatures from a pool of meshes where the model asks for them."""
+    listed = split.test_pairs[: cfg.eval_pairs]
+    pools: dict[str, MeshPool | None] = {"train": None, "test": None}
+    if cfg.model.descriptors == "wks":
+        shared: dict[str, Any] = {"num_signatures": cfg.model.num_signatures, "workers": workers, "progress": True}
+        who, how = listed.view(-1, 2).unbind(1)
+        make = {
+            "train": lambda: MeshPool.build(
+                body, split.train_identities, split.train_poses, cfg.pool, seed=cfg.seed, **shared
+            ),
+            "test": lambda: MeshPool.of(body, who, how, **shared),
+        }
+        for side in pools:
+            key = f"{side}, {cfg.data}, {len(body.template)} vertices, {cfg.model.num_signatures} signatures, "
+            key += f"pool {cfg.pool}, seed {cfg.seed}" if side == "train" else f"{len(listed)} pairs"
+            stored = run.load_tensors(f"pool_{side}.safetensors", key)
+            if stored is None:
+                print(f"meshes to {side} on:", flush=True)
+                stored = make[side]().state_dict()
+                run.save_tensors(f"pool_{side}.safetensors", stored, key)
+            pools[side] = MeshPool(**stored)
+    train = PosePairs(
+        body,
+        split.train_identities,
+        split.train_poses,
+        length=cfg.pairs,
+        seed=cfg.seed,
+        resample=cfg.resample,
+        pool=pools["train"],
+        ground_truth=cfg.ground_truth,
+    )
+    return train, PosePairs(body, split.test_identities, split.test_poses, pool=pools["test"], listed=listed)

@@ -1,0 +1,46 @@
+"""Connecting the processes of a run: one by default, several with ``--devices`` or under torchrun."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from datetime import timedelta
+from typing import Any, TypeVar, cast
+
+import torch
+from _machine import pick_precision, world_size
+from _run import UserError
+from _settings import Settings
+from lightning_fabric import Fabric
+from lightning_fabric.strategies.ddp import DDPStrategy
+
+S = TypeVar("S", bound=Settings)
+
+
+def connect(cfg: S) -> tuple[Fabric, S]:
+    """Fabric with its processes started, and the configuration with the precision that was picked."""
+    if cfg.precision == "auto":
+        cfg = replace(cfg, precision=pick_precision(Fabric(accelerator=cfg.accelerator, **shape(cfg)).device))
+    fabric = Fabric(accelerator=cfg.accelerator, precision=cast(Any, cfg.precision), **shape(cfg))
+    fabric.launch()
+    if fabric.world_size > 1:
+        share = fabric.all_reduce(torch.tensor(float(cfg.precision == "bf16-mixed"), device=fabric.device))
+        if cast(torch.Tensor, share) not in (0, 1):
+            raise UserError("the processes do not agree on whether bfloat16 is faster: choose with --precision")
+    if cfg.graph and fabric.device.type != "cuda":
+        raise UserError(f"--graph records CUDA kernels, but this run is on {fabric.device}: leave it out")
+    if cfg.graph and (cfg.compile or fabric.world_size > 1):
+        raise UserError("--graph is for one process and without --compile: leave one of them out")
+    return fabric, cfg
+
+
+def shape(cfg: Settings) -> dict[str, Any]:
+    """Number and kind of the processes."""
+    if world_size(cfg.devices) == 1:
+        return {"devices": 1}
+    # The other processes wait while the first computes descriptors and figures.
+    strategy = DDPStrategy(timeout=timedelta(hours=6))
+    if "LOCAL_WORLD_SIZE" not in os.environ:  # not torchrun: Fabric starts the other processes
+        return {"devices": cfg.devices, "strategy": strategy}
+    each = int(os.environ["LOCAL_WORLD_SIZE"])
+    return {"devices": each, "num_nodes": int(os.environ["WORLD_SIZE"]) // each, "strategy": strategy}

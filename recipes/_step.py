@@ -1,0 +1,125 @@
+"""One update of the weights, on one process or a part of it on each of several; and how many fit into a given time."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, cast
+
+import torch
+from _graph import GraphedStep
+from _run import UserError
+from _settings import Settings
+from lightning_fabric import Fabric
+from torch import Tensor, nn
+
+from meshkit.data import PairBatch
+
+Step = Callable[[nn.Module, PairBatch, Any, float], dict[str, Tensor]]
+
+
+class Diverged(UserError):
+    """A loss or its gradient is not finite."""
+
+
+def learning_rate(cfg: Settings, s: int, steps: int) -> float:
+    """Linear warm-up, flat, then linear to zero."""
+    rise = min(1.0, (s + 1) / cfg.warmup) if cfg.warmup else 1.0
+    fall = min(1.0, (1 - s / steps) / (1 - cfg.decay_from)) if cfg.decay_from < 1 else 1.0
+    return cfg.lr * rise * fall
+
+
+def parts(batch: PairBatch, count: int) -> list[PairBatch]:
+    """The batch in ``count`` equal parts."""
+    pieces: dict[str, Any] = {}
+    for f in fields(batch):
+        value = getattr(batch, f.name)
+        pieces[f.name] = [None] * count if value is None else value.chunk(count)
+    return [PairBatch(**{name: values[j] for name, values in pieces.items()}) for j in range(count)]
+
+
+class Trainer:
+    """What one update needs: the trained module, its optimiser, and the recipe's step."""
+
+    def __init__(self, fabric: Fabric, system: Any, optimizer: Any, cfg: Settings, step: Step, steps: int) -> None:
+        self.fabric, self.system, self.optimizer = fabric, system, optimizer
+        self.cfg, self.step, self.steps = cfg, step, steps
+        self.graphed: GraphedStep | None = None
+
+    def update(self, batch: PairBatch, s: int) -> dict[str, float]:
+        """One update; everything random in it follows from the seed, the step and the number of the process.
+
+        Losses are means over the samples of all processes and accumulated batches.
+        """
+        torch.manual_seed(self.cfg.seed * 1_000_003 + s * 7919 + self.fabric.global_rank)
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.cfg, s, self.steps)
+        try:
+            losses, norm = self.gradients(batch, s)
+        except ValueError as error:
+            raise Diverged(f"{error} {where(batch, s)}") from None
+        # One transfer tells everything: on a GPU each waits for all that was launched.
+        *values, size = torch.stack([*losses.values(), norm]).tolist()
+        # Weights that turn NaN would be saved; they are looked at before, not after, the update.
+        if not math.isfinite(sum(values) + size):
+            raise Diverged(f"the loss is {sum(values)}, its gradient {size} {where(batch, s)}")
+        self.optimizer.step()
+        if self.fabric.world_size > 1:
+            values = cast(Tensor, self.fabric.all_reduce(torch.tensor(values, device=self.fabric.device))).tolist()
+        return dict(zip(losses, values, strict=True)) | {"loss": sum(values)}
+
+    def gradients(self, batch: PairBatch, s: int) -> tuple[dict[str, Tensor], Tensor]:
+        """Losses, and the norm of their sum's gradient, which is left at the parameters."""
+        cfg: Any = self.cfg
+        solving = getattr(cfg, "arap", False) and s >= cfg.arap_from * self.steps  # a solver looks at its residuals
+        if not cfg.graph or solving:
+            self.optimizer.zero_grad()
+            return self.backward(batch, s)
+        if self.graphed is None:
+            self.graphed = GraphedStep(self, batch, s)
+        return self.graphed(batch)
+
+    def backward(self, batch: PairBatch, s: int) -> tuple[dict[str, Tensor], Tensor]:
+        """Forward and backward pass, in ``accumulate`` parts."""
+        count, several = self.cfg.accumulate, self.fabric.world_size > 1
+        sums: dict[str, Tensor] = {}
+        for j, part in enumerate(parts(batch, count)):
+            # Processes exchange gradients once, with the last part.
+            with self.fabric.no_backward_sync(self.system, enabled=several and j + 1 < count):
+                losses = self.step(self.system, part, self.cfg, s / self.steps)
+                self.fabric.backward(torch.stack(list(losses.values())).sum() / count)
+            sums = {name: sums.get(name, 0.0) + loss.detach() / count for name, loss in losses.items()}
+        gradients = [p.grad for p in self.system.parameters() if p.grad is not None]
+        return sums, torch.nn.utils.get_total_norm(gradients)
+
+
+def where(batch: PairBatch, s: int) -> str:
+    return f"at step {s} (identities {batch.identity_index.tolist()}, poses {batch.pose_index.tolist()})"
+
+
+def count_steps(trainer: Trainer, loader: Any) -> int:
+    """Steps that fit into ``minutes``, from the speed of a few steps on copies that are thrown away.
+
+    They are timed at the beginning and at the end of a run, between which a step may change at ``arap_from``.
+    """
+    cfg, system, optimizer = trainer.cfg, trainer.system, trainer.optimizer
+    if cfg.steps is not None:
+        return cfg.steps
+    assert cfg.minutes is not None
+    weights, moments = copy.deepcopy(system.state_dict()), copy.deepcopy(optimizer.state_dict())
+    trainer.steps, seconds = 1000, []
+    for first in (0, 995):
+        times = []
+        for s, batch in zip(range(first, first + 5), loader, strict=False):
+            start = time.perf_counter()
+            trainer.update(batch.to(trainer.fabric.device), s)
+            times.append(time.perf_counter() - start)
+        seconds.append(sorted(times[1:])[1])
+    system.load_state_dict(weights)
+    optimizer.load_state_dict(moments)
+    share = 1 - getattr(cfg, "arap_from", 1.0) if getattr(cfg, "arap", False) else 0.0
+    steps = max(1, round(cfg.minutes * 60 / ((1 - share) * seconds[0] + share * seconds[1])))
+    return int(trainer.fabric.broadcast(steps))

@@ -1,0 +1,326 @@
+"""The other recipes: what they minimise, and that each runs from data to report."""
+
+import errno
+import json
+import math
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from recipe_runs import read_json, read_log, recipe_module
+
+from meshkit.data import PairBatch, PosePairs, human_split, load_humans
+from meshkit.io import save_mesh
+from meshkit.models import GeneratorConfig, load_generator
+from meshkit.norm import SPAdaIN
+
+pytest.importorskip("tyro")
+pytest.importorskip("lightning_fabric")
+
+TINY = (
+    *("--threads", 1, "--accelerator", "cpu", "--precision", "32-true"),
+    *("--pairs", 12, "--pool", 3, "--eval-pairs", 2, "--batch", 2),
+)
+SMALL_EXTRACTOR = ("--model.k", 4, "--model.extractor-widths", 8, 8)
+WITHOUT_DESCRIPTORS = ("--model.descriptors", "none", "--model.condition", "features")
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Path]:
+    """Runs a recipe's ``main`` in this process and gives the run's folder."""
+
+    def run(recipe: str, *arguments: Any) -> Path:
+        words = [f"{recipe}.py", "--out", tmp_path, "--name", "run", *TINY, *arguments]
+        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+        recipe_module(recipe).main()
+        return tmp_path / "run"
+
+    return run
+
+
+@pytest.fixture
+def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that look at training alone: figures and pictures take longer than a few small steps."""
+    monkeypatch.setattr(recipe_module("_train"), "report", lambda *_: None)
+
+
+@pytest.fixture(scope="module")
+def batch() -> PairBatch:
+    split = human_split()
+    return PosePairs(load_humans(), split.train_identities, split.train_poses)[[(0, 0), (0, 1)]]
+
+
+def small(recipe: ModuleType, **changes: Any) -> Any:
+    model = GeneratorConfig(widths=(8, 8), extractor_widths=(8, 8), k=4)
+    return replace(recipe.PRESETS["tiny"], model=model, **changes)
+
+
+def mean_ratio_penalty(output: torch.Tensor, rest: torch.Tensor, faces: torch.Tensor) -> float:
+    """Mean over faces of the sum over their edges of \\|length / length at rest - 1\\|, then over samples."""
+    values = []
+    for x, a, f in zip(output.double(), rest.double(), faces, strict=True):
+        new, old = ((v[f] - v[f].roll(1, 1)).norm(dim=2) for v in (x, a))
+        values.append((new / old - 1).abs().sum(1).mean())
+    return float(torch.stack(values).mean())
+
+
+# 3D-CoreNet
+
+
+def test_corenet3d_compares_with_the_truth(batch: PairBatch) -> None:
+    recipe = recipe_module("corenet3d")
+    cfg = small(recipe)
+    torch.manual_seed(0)
+    generator, system = recipe.build(cfg)
+    losses = {name: value.detach() for name, value in recipe.step(system, batch, cfg, 0.0).items()}
+    output = generator(batch.identity, batch.pose).vertices.detach()
+    expected = cfg.lambda_rec * (output - batch.ground_truth).double().square().mean((1, 2)).mean()
+    assert float(losses["rec"]) == pytest.approx(float(expected), rel=1e-4)
+    penalty = mean_ratio_penalty(output, batch.identity, batch.identity_faces)
+    assert float(losses["edge"]) == pytest.approx(cfg.lambda_edge * penalty, rel=1e-4)
+
+
+def test_corenet3d_for_a_time_without_descriptors(run: Any) -> None:
+    folder = run("corenet3d", "--minutes", 0.02, *WITHOUT_DESCRIPTORS, *SMALL_EXTRACTOR, "--model.widths", 16, 8)
+    steps = read_json(folder / "config.json")["steps"]
+    assert steps >= 1
+    records = read_log(folder)
+    assert [record["step"] for record in records] == list(range(1, steps + 1))
+    assert set(records[0]) - {"step", "seconds", "eval"} == {"rec", "edge", "loss"}
+    summary = read_json(folder / "summary.json")
+    assert (summary["steps"], summary["pairs_seen"]) == (steps, steps * 2)
+    # Within a factor of the speed measured at the start; machines are not that steady.
+    assert records[-1]["seconds"] < 10 * 0.02 * 60
+    assert not list(folder.glob("pool_*"))
+    assert load_generator(folder)[1].descriptors == "none"
+
+
+@pytest.mark.usefixtures("without_report")
+def test_corenet3d_with_spadain(run: Any) -> None:
+    folder = run("corenet3d", "--norm", "spadain", "--steps", 1, *WITHOUT_DESCRIPTORS, *SMALL_EXTRACTOR)
+    generator, model = load_generator(folder)
+    assert model.norm == "spadain"
+    assert all(isinstance(norm, SPAdaIN) for block in generator.transfer.blocks for norm in norms(block))
+
+
+def norms(block: torch.nn.Module) -> list[torch.nn.Module]:
+    return [block.norm_0, block.norm_1, block.norm_s]
+
+
+# NPT
+
+
+def test_npt_compares_with_the_truth(batch: PairBatch) -> None:
+    recipe = recipe_module("npt")
+    cfg = replace(recipe.PRESETS["tiny"], model=GeneratorConfig("npt_maxpool", extractor_widths=(8, 9)))
+    torch.manual_seed(0)
+    generator, system = recipe.build(cfg)
+    losses = {name: value.detach() for name, value in recipe.step(system, batch, cfg, 0.0).items()}
+    output = generator(batch.identity, batch.pose).vertices.detach()
+    expected = (output - batch.ground_truth).double().square().mean((1, 2)).mean()
+    assert float(losses["rec"]) == pytest.approx(float(expected), rel=1e-4)
+    penalty = mean_ratio_penalty(output, batch.identity, batch.identity_faces)
+    assert float(losses["edge"]) == pytest.approx(0.0005 * penalty, rel=1e-4)
+
+
+def test_npt_paper_preset_is_the_published_setting() -> None:
+    cfg = recipe_module("npt").PRESETS["paper"]
+    assert (cfg.lr, cfg.batch, cfg.steps) == (5e-5, 8, 1000 * cfg.pairs // 8)
+    assert (cfg.lambda_rec, cfg.lambda_edge) == (1.0, 0.0005)
+
+
+@pytest.mark.parametrize("variant", ["maxpool", "original"])
+def test_npt_trains(run: Any, variant: str) -> None:
+    folder = run("npt", "--variant", variant, "--steps", 2, "--model.extractor-widths", 8, 9)
+    assert load_generator(folder)[0].variant == variant
+    figures = read_json(folder / "summary.json")["test"]
+    assert set(figures) == {"pmd", "chamfer", "pmd_copy_identity", "chamfer_copy_identity"}
+
+
+# The baseline of cycles
+
+
+def test_cycle_baseline_asks_for_both_meshes_back(batch: PairBatch) -> None:
+    recipe = recipe_module("cycle_baseline")
+    cfg = small(recipe, lambda_self=500.0)
+    torch.manual_seed(0)
+    generator, system = recipe.build(cfg)
+    generator.eval()  # each pass moves the spectral norms' buffers
+    losses = {name: float(value.detach()) for name, value in recipe.step(system, batch, cfg, 0.0).items()}
+
+    def passed(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        return generator(a, b).vertices.detach()
+
+    a, b = batch.identity, batch.pose
+    ab, ba = passed(a, b), passed(b, a)
+    expected = {
+        "cycle_a": 2000 * (passed(ab, ba) - a).square().mean(),
+        "cycle_b": 2000 * (passed(ba, ab) - b).square().mean(),
+        "self": 500 * (passed(a, a) - a).square().mean(),
+    }
+    assert losses == {name: pytest.approx(float(value), rel=1e-3) for name, value in expected.items()}
+
+
+@pytest.mark.usefixtures("without_report")
+def test_cycle_baseline_trains(run: Any) -> None:
+    folder = run("cycle_baseline", "--steps", 1, *WITHOUT_DESCRIPTORS, *SMALL_EXTRACTOR, "--model.widths", 16, 8)
+    assert set(read_log(folder)[0]) == {"step", "seconds", "cycle_a", "cycle_b", "self", "loss"}
+
+
+# Deformation transfer
+
+
+@pytest.mark.parametrize("source", ["subject", "template"])
+def test_deformation_transfer_is_near_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str) -> None:
+    """Told the source in the identity's pose it must beat any copy by far; with the average body it is off by shape."""
+    words = ["x", "--out", tmp_path, "--name", "dt", "--eval-pairs", 3, "--source", source, "--threads", 1]
+    monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+    recipe_module("deformation_transfer").main()
+    figures = read_json(tmp_path / "dt" / "summary.json")["test"]
+    assert figures["pmd"] < figures["pmd_copy_identity"] * (0.02 if source == "subject" else 0.3)
+
+
+def test_deformation_transfer_needs_a_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for arguments, said in ((["--data", "folder:x"], "a rigged body is needed"), (["--eval-pairs", "0"], "400 test")):
+        monkeypatch.setattr(sys, "argv", ["x", "--out", str(tmp_path), *arguments])
+        with pytest.raises(recipe_module("_run").UserError, match=said):
+            recipe_module("deformation_transfer").main()
+
+
+# Data
+
+
+def body_files(folder: Path, identities: range, poses: range) -> Path:
+    body, other = load_humans(1000), load_humans(2000)
+    for who in identities:
+        for how in poses:
+            model = body if who % 2 else other
+            verts = model(torch.tensor([who]), torch.tensor([how]))[0]
+            save_mesh(folder / f"{who}_{how}.ply", verts, model.faces)
+    return folder
+
+
+FAST = ("--steps", 1, *WITHOUT_DESCRIPTORS, *SMALL_EXTRACTOR, "--model.widths", 8, 8)
+
+
+def test_meshes_of_different_sizes_from_a_folder(run: Any, tmp_path: Path) -> None:
+    place = body_files(tmp_path / "meshes", range(4), range(4))
+    folder = run("corenet3d", "--data", f"folder:{place}", "--eval-pairs", 1, *FAST)
+    assert read_json(folder / "summary.json")["test"]["pmd"] > 0
+    assert (folder / "sheet.png").exists()
+
+
+def test_unsupervised_training_on_meshes_without_ground_truth(run: Any, tmp_path: Path) -> None:
+    place = tmp_path / "wardrobe"
+    for who in range(10):
+        body = load_humans(1000)
+        verts = body(torch.tensor([who]), torch.tensor([who]))[0]
+        save_mesh(place / f"person{who}" / "smpl_registered.obj", verts, body.faces)
+    folder = run("xdualnet", "--data", f"mgn:{place}", "--points", "None", "--no-arap", *FAST)
+    assert read_json(folder / "summary.json")["test"].keys() == {"correspondence_m"}  # of one topology
+    assert not (folder / "meshes" / "pair0_ground_truth.obj").exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("cars", "must be humans, animals"),
+        ("humans:here", "must be humans, animals"),
+        ("folder", "must be humans, animals|there is no"),
+        ("faust:nowhere", "there is no nowhere"),
+        ("smpl:README.md", "cannot be read"),
+        ("folder:docs", "{identity}_{pose}"),
+    ],
+)
+def test_wrong_data_is_named(run: Any, word: str, said: str) -> None:
+    with pytest.raises(recipe_module("_run").UserError) as caught:
+        run("corenet3d", "--data", word, *FAST)
+    assert any(part in str(caught.value) for part in said.split("|")), str(caught.value)
+
+
+def test_files_and_signatures_do_not_go_together(run: Any, tmp_path: Path) -> None:
+    place = body_files(tmp_path / "meshes", range(1), range(1))
+    with pytest.raises(recipe_module("_run").UserError, match=r"--model\.descriptors none"):
+        run("corenet3d", "--data", f"folder:{place}", "--steps", 1)
+    with pytest.raises(recipe_module("_run").UserError, match="0 meshes to train on are too few, of 1"):
+        run("corenet3d", "--data", f"folder:{place}", *FAST)
+
+
+# Failures
+
+
+@pytest.mark.usefixtures("without_report")
+def test_a_full_disk_leaves_the_last_checkpoint(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written, save = [], torch.save
+
+    def save_until_full(state: Any, path: Path) -> None:
+        save(state, path)
+        written.append(path)
+        if len(written) > 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(torch, "save", save_until_full)
+    arguments = ("corenet3d", "--save-every", 1, "--resume", *FAST, "--steps", 4)
+    with pytest.raises(recipe_module("_run").UserError) as caught:
+        run(*arguments)
+    folder, said = tmp_path / "run", str(caught.value)
+    assert "state.pt: No space left on device" in said and "after step 2, is usable" in said and "\n" not in said
+    assert torch.load(folder / "state.pt", weights_only=True)["step"] == 2
+    assert not [file for file in folder.iterdir() if file.name.startswith(".")]
+    monkeypatch.setattr(torch, "save", save)
+    run(*arguments)
+    assert [record["step"] for record in read_log(folder)] == [1, 2, 3, 4]
+
+
+def test_a_loss_that_is_nan_is_told_with_step_pairs_and_checkpoint(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, seen = recipe_module("corenet3d"), []
+    step = recipe.step
+
+    def step_until_nan(system: torch.nn.Module, batch: PairBatch, *others: Any) -> dict[str, torch.Tensor]:
+        seen.append(batch)
+        return {
+            name: loss * (math.nan if len(seen) == 4 else 1.0) for name, loss in step(system, batch, *others).items()
+        }
+
+    monkeypatch.setattr(recipe, "step", step_until_nan)
+    with pytest.raises(recipe_module("_run").UserError) as caught:
+        run("corenet3d", "--save-every", 2, *FAST, "--steps", 6)
+    said = str(caught.value)
+    assert "the loss is nan" in said and "at step 3 " in said and "after step 2, is usable" in said
+    assert str(seen[-1].identity_index.tolist()) in said and str(seen[-1].pose_index.tolist()) in said
+    state = torch.load(tmp_path / "run" / "state.pt", weights_only=True)
+    assert state["step"] == 2 and all(bool(value.isfinite().all()) for value in state["model"].values())
+
+
+# Larger batches
+
+
+@pytest.mark.usefixtures("without_report")
+def test_accumulated_batches_equal_one_large_batch(run: Any) -> None:
+    """Without spectral normalisation, whose power iterations go on with every pass."""
+    logs = []
+    for name, sizes in (("large", (4, 1)), ("parts", (1, 4))):
+        batches = ("--batch", sizes[0], "--accumulate", sizes[1])
+        folder = run("corenet3d", *FAST, "--model.no-spectral", "--steps", 3, "--name", name, *batches).parent / name
+        logs.append([record["loss"] for record in read_log(folder)])
+    assert logs[0] == pytest.approx(logs[1], rel=1e-4)
+
+
+def test_another_number_of_processes_keeps_the_pairs_of_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    setup, cfg = recipe_module("_setup"), replace(recipe_module("corenet3d").PRESETS["tiny"], batch=2, accumulate=2)
+    recorded = json.dumps(asdict(cfg), default=str)
+    for processes, expected in ((1, (2, 4)), (2, (2, 2)), (4, (2, 1)), (8, (1, 1))):
+        monkeypatch.setenv("WORLD_SIZE", str(processes))
+        begun = setup.resumed(cfg, json.loads(recorded), 8)
+        assert (begun.batch, begun.accumulate) == expected
+    monkeypatch.setenv("WORLD_SIZE", "3")
+    with pytest.raises(recipe_module("_run").UserError, match="8 pairs per step, which 3 processes"):
+        setup.resumed(cfg, json.loads(recorded), 8)
