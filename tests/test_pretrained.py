@@ -20,7 +20,7 @@ from meshkit.models.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
 PLAIN = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16), residual=True)
-DESCRIBED = replace(PRESETS["tiny"], widths=(16, 8))
+DESCRIBED = replace(PRESETS["tiny"], widths=(16, 8), symmetry=False)
 
 
 def network(config: GeneratorConfig, seed: int = 0) -> PretrainedTransfer:
@@ -56,6 +56,24 @@ def test_the_wrapper_centres_describes_and_puts_back(bodies):
     assert_near(posed, by_hand.vertices[0] + where, 1e-4)
     assert_near(output.warped, by_hand.warped[0] + where, 1e-4)
     assert output.plan.shape == (1, 1000, 1000)
+
+
+def test_weights_that_know_of_mirror_images_are_given_the_faces(bodies):
+    identity, pose, faces = bodies
+    net = network(replace(DESCRIBED, symmetry=True))
+    with torch.no_grad():
+        by_hand = net.generator(
+            center(identity[None]),
+            center(pose[None]),
+            identity_descriptors=intrinsic_descriptors(identity, faces, method="fast")[None],
+            pose_descriptors=intrinsic_descriptors(pose, faces, method="fast")[None],
+            identity_faces=faces,
+        )
+        posed = net(identity, pose[None], identity_faces=faces, pose_faces=faces)
+        net.generator.symmetry = False
+        without = net(identity, pose[None], identity_faces=faces, pose_faces=faces)
+    assert_near(posed, by_hand.vertices + bounding_box_center(pose[None]), 1e-4)
+    assert not torch.allclose(posed, without, atol=1e-4)
 
 
 def test_one_identity_serves_a_batch_of_poses():
