@@ -190,7 +190,7 @@ def test_export_and_load_again(exporter, finished_run, bodies, tmp_path, monkeyp
 
 def test_a_folder_without_a_run_is_refused(exporter, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["export_weights.py", str(tmp_path), "x"])
-    with pytest.raises(SystemExit, match="is not a finished run"):
+    with pytest.raises(SystemExit, match="is not a finished run on shipped bodies"):
         exporter.main()
 
 

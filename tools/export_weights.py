@@ -209,9 +209,9 @@ def main() -> None:
         config, summary, machine = (
             json.loads((args.run / f"{part}.json").read_text()) for part in ("config", "summary", "machine")
         )
+        body, split = load_shipped(config["data"], config["vertices"])
     except (OSError, ValueError) as error:
-        raise SystemExit(f"error: {args.run} is not a finished run: {error}") from None
-    body, split = load_shipped(config["data"], config["vertices"])
+        raise SystemExit(f"error: {args.run} is not a finished run on shipped bodies: {error}") from None
     state = rounded(generator.state_dict(), {key for key, _ in generator.named_parameters()})
     exported = model.build()
     exported.load_state_dict({key: v.float() if v.is_floating_point() else v for key, v in state.items()})
