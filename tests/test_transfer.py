@@ -510,7 +510,7 @@ def fine_transfer():
 @pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
 @pytest.mark.parametrize("case", CASES)
 def test_pose_meshes_of_any_origin(case, fine_transfer):
-    """The result is near the truth, in the axes and unit of the pose mesh; a wrong guess of the axes is in doubt."""
+    """The result is near the truth, in axes and unit of the pose mesh; a wrong guess of the axes is in doubt."""
     transfer, pose, truth = fine_transfer
     change = CASES[case]
     result = transfer(change(pose))

@@ -128,10 +128,10 @@ class PretrainedTransfer(nn.Module):
         centred = center(verts, mask)
         sides: dict[str, Any] = {name: centred, f"{name}_mask": mask}
         if isinstance(self.generator, PoseTransferGenerator):
+            if name == "identity" and self.generator.symmetry and faces is not None:
+                sides["identity_faces"] = faces if faces.dim() == 3 else faces[None]
             sides[f"{name}_descriptors"] = descriptors
             sides[f"{name}_features"] = self.generator.encode(centred, mask=mask, descriptors=descriptors)
-            if name == "identity" and self.generator.symmetry:
-                sides["identity_faces"] = faces
         return sides
 
 
