@@ -42,11 +42,11 @@ class Config(Settings):
 
 
 PRESETS = {
-    "tiny": Config(model=MODELS["tiny"], lr=2e-3),
+    "tiny": Config(model=replace(MODELS["tiny"], symmetry=False), lr=2e-3),
     "small": Config(
         preset="small",
         name="corenet3d-small",
-        model=MODELS["small"],
+        model=replace(MODELS["small"], symmetry=False),
         minutes=None,
         steps=6000,
         batch=16,
