@@ -35,6 +35,7 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
             center(pose[None]),
             identity_descriptors=descriptors[0],
             pose_descriptors=descriptors[1],
+            **({"identity_faces": faces} if getattr(generator, "symmetry", False) else {}),
         )
         # Training meshes are centred; the result goes to where the pose mesh stands.
         save_mesh(result, output.vertices[0] + bounding_box_center(pose[None])[0], faces)

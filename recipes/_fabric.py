@@ -29,6 +29,10 @@ def connect(cfg: S) -> tuple[Fabric, S]:
             raise UserError("the processes do not agree on whether bfloat16 is faster: choose with --precision")
     if cfg.graph and fabric.device.type != "cuda":
         raise UserError(f"--graph records CUDA kernels, but this run is on {fabric.device}: leave it out")
+    if cfg.graph and cfg.data not in ("humans", "animals"):
+        raise UserError("--graph needs meshes of one size, those of --data humans or animals: leave it out")
+    if cfg.workers and fabric.device.type != "cpu" and cfg.data in ("humans", "animals"):
+        raise UserError(f"pairs of --data {cfg.data} are made on {fabric.device} itself: leave --workers out")
     if cfg.graph and (cfg.compile or fabric.world_size > 1):
         raise UserError("--graph is for one process and without --compile: leave one of them out")
     return fabric, cfg

@@ -20,6 +20,7 @@ class GraphedStep:
 
     def __init__(self, trainer: Any, batch: PairBatch, s: int) -> None:
         self.batch = copy.deepcopy(batch)
+        dice = torch.cuda.get_rng_state()
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         state = copy.deepcopy(trainer.system.state_dict())
@@ -33,12 +34,16 @@ class GraphedStep:
         self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self.graph):
             self.results = trainer.backward(self.batch, s)
+        self.gradients = [(p, p.grad) for p in trainer.system.parameters()]
+        torch.cuda.set_rng_state(dice)  # the first replay draws what an eager step would have
 
     def __call__(self, batch: PairBatch) -> tuple[dict[str, Tensor], Tensor]:
         """Losses and the gradient's norm. Gradients are written, not added to what was there."""
         for field in fields(batch):
-            value = getattr(batch, field.name)
+            value, place = getattr(batch, field.name), getattr(self.batch, field.name)
             if value is not None:
-                getattr(self.batch, field.name).copy_(value)
+                place.copy_(value)
         self.graph.replay()
+        for parameter, gradient in self.gradients:  # an eager step in between has let go of them
+            parameter.grad = gradient
         return self.results

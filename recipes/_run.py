@@ -195,6 +195,10 @@ class Interruption:
         asked = torch.tensor(float(self._asked), device=self._fabric.device)
         return bool(self._fabric.all_reduce(asked, reduce_op="sum") > 0)
 
+    def over(self) -> None:
+        """Ctrl-C interrupts at once again."""
+        signal.signal(signal.SIGINT, self._previous)
+
     def _note(self, *_: Any) -> None:
         self._asked = True
         signal.signal(signal.SIGINT, self._previous)

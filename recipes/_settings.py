@@ -30,7 +30,7 @@ class Settings:
     """Folder that holds the runs."""
     resume: bool = False
     """Go on from the run's last checkpoint, if it has one, with the settings it was begun with: of the other flags only
-    --out, --name, --threads, --accelerator and --devices count then."""
+    --out, --name, --threads, --accelerator, --devices, --graph, --compile and --workers count then."""
     apply: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="IDENTITY POSE")] = None
     """Do not train: give the first mesh file the pose of the second, with the weights of run --name."""
     result: Path = Path("posed.obj")

@@ -55,6 +55,7 @@ def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = Non
         values = {key: value for key, value in recorded.items() if key in type(cfg).__dataclass_fields__}
         values |= {"betas": tuple(values["betas"]), "out": cfg.out, "name": cfg.name, "resume": True, "apply": None}
         values |= {"result": cfg.result, "threads": cfg.threads, "accelerator": cfg.accelerator, "devices": cfg.devices}
+        values |= {"graph": cfg.graph, "compile": cfg.compile, "workers": cfg.workers}
         begun = type(cfg)(**values, model=model)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"config.json of {cfg.out / cfg.name} is no run's ({error}): choose another --name") from None

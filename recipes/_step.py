@@ -60,7 +60,7 @@ class Trainer:
         try:
             losses, norm = self.gradients(batch, s)
         except ValueError as error:
-            raise Diverged(f"{error} {where(batch, s)}") from None
+            raise UserError(f"{error} ({where(batch, s)})") from None
         # One transfer tells everything: on a GPU each waits for all that was launched.
         *values, size = torch.stack([*losses.values(), norm]).tolist()
         # Weights that turn NaN would be saved; they are looked at before, not after, the update.
@@ -103,15 +103,16 @@ def where(batch: PairBatch, s: int) -> str:
 def count_steps(trainer: Trainer, loader: Any) -> int:
     """Steps that fit into ``minutes``, from the speed of a few steps on copies that are thrown away.
 
-    They are timed at the beginning and at the end of a run, between which a step may change at ``arap_from``.
+    They are timed at the beginning of a run, and at its end if a step changes in between, at ``arap_from``.
     """
     cfg, system, optimizer = trainer.cfg, trainer.system, trainer.optimizer
     if cfg.steps is not None:
         return cfg.steps
     assert cfg.minutes is not None
     weights, moments = copy.deepcopy(system.state_dict()), copy.deepcopy(optimizer.state_dict())
+    share = 1 - getattr(cfg, "arap_from", 1.0) if getattr(cfg, "arap", False) else 0.0
     trainer.steps, seconds = 1000, []
-    for first in (0, 995):
+    for first in (0, 995) if share else (0,):
         times = []
         for s, batch in zip(range(first, first + 5), loader, strict=False):
             start = time.perf_counter()
@@ -120,6 +121,5 @@ def count_steps(trainer: Trainer, loader: Any) -> int:
         seconds.append(sorted(times[1:])[1])
     system.load_state_dict(weights)
     optimizer.load_state_dict(moments)
-    share = 1 - getattr(cfg, "arap_from", 1.0) if getattr(cfg, "arap", False) else 0.0
-    steps = max(1, round(cfg.minutes * 60 / ((1 - share) * seconds[0] + share * seconds[1])))
+    steps = max(1, round(cfg.minutes * 60 / ((1 - share) * seconds[0] + share * seconds[-1])))
     return int(trainer.fabric.broadcast(steps))

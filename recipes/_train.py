@@ -8,7 +8,6 @@ that is over. Each is written for one process; here any number of them work on p
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 from collections.abc import Callable
@@ -115,8 +114,8 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         if (s + 1) % cfg.eval_every == 0 and s + 1 < steps and run.writes:
             few = min(24, len(test_pairs))
             record["eval"] = evaluate(generator, test_pairs, fabric.device, few)
-            score = record["eval"].get("pmd", math.nan)
-            bar.write(f"step {s + 1}: PMD {score:.2f}e-3 on {few} unseen pairs")
+            if "pmd" in record["eval"]:
+                bar.write(f"step {s + 1}: PMD {record['eval']['pmd']:.2f}e-3 on {few} unseen pairs")
         run.log(record)
         stop = interruption.wanted
         if (s + 1) % cfg.save_every == 0 or s + 1 == steps or stop:
@@ -128,6 +127,7 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
                 print(f"interrupted after step {s + 1}, which is saved: --resume goes on from there", file=sys.stderr)
             raise SystemExit(130)
         clock = time.perf_counter()
+    interruption.over()
     if run.writes:
         facts = {
             "steps": steps,

@@ -37,8 +37,8 @@ class Config(Settings):
     """Weight of the reconstruction. Released code: 1000."""
     lambda_edge: float = 0.5
     """Weight of the edge loss (length ratios). Released code: 0.5."""
-    norm: Literal["elain", "spadain"] = "elain"
-    """Conditional norm of the blocks; spadain is the paper's ablation of ElaIN."""
+    norm: Literal["elain", "spadain"] | None = None
+    """Conditional norm of the blocks, None for that of --model.norm; spadain is the paper's ablation of ElaIN."""
 
 
 PRESETS = {
@@ -98,7 +98,8 @@ def main() -> None:
     if cfg.apply is not None:
         apply(cfg.out / cfg.name, cfg.apply, cfg.result)
     else:
-        train(replace(cfg, model=replace(cfg.model, norm=cfg.norm)), build, step)
+        model = cfg.model if cfg.norm is None else replace(cfg.model, norm=cfg.norm)
+        train(replace(cfg, model=model), build, step)
 
 
 if __name__ == "__main__":

@@ -63,6 +63,22 @@ def test_readings_and_gradients_equal_the_loop(name, sizes, n_iters, monkeypatch
         assert_near(got, expected, 1e-11, scale=max(1e-3, expected.abs().amax().item()))  # row sums are constant
 
 
+@pytest.mark.parametrize("name", [n for n in READINGS if n not in ("row sums", "column sums")])
+@pytest.mark.parametrize("silent", [torch.no_grad, torch.inference_mode])
+def test_a_reading_without_gradient_does_not_cut_the_graph(name, silent, together):
+    gradients = []
+    for early in (False, True):
+        fx, fy = rand(2, 5, 4).requires_grad_(), rand(2, 6, 4, seed=1).requires_grad_()
+        plan = sinkhorn(fx, fy, eps=0.2)
+        if early:
+            with silent():
+                plan.argmax()
+        value = READINGS[name](plan, rand(2, 6, 3, seed=2), rand(2, 5, 2, seed=3))
+        gradients.append(torch.autograd.grad(value.sin().sum(), (fx, fy)))
+    for got, expected in zip(*gradients, strict=True):
+        assert_near(got, expected, 1e-12)
+
+
 def test_equals_algorithm_1(together):
     fx, fy = rand(2, 7, 3), rand(2, 5, 3, seed=1)
     plan = sinkhorn(fx, fy)

@@ -84,9 +84,11 @@ def test_exchanged_calves_are_put_right(person):
     assert (mended - posed).norm(dim=1).max() < 0.1 < (matched - posed).norm(dim=1).max()
 
 
-def test_a_good_matching_is_left_alone_and_a_mirrored_one_turned(person):
+@pytest.mark.parametrize("inwards", [False, True])
+def test_a_good_matching_is_left_alone_and_a_mirrored_one_turned(person, inwards):
     """Up to vertices at the middle, where a vertex and its partner are one place."""
     rest, faces, posed, partner = person
+    faces = faces.flip(1) if inwards else faces
     for matched, mirrored in ((posed, posed[partner]), (posed[partner], posed)):
         labels = mirror_labels(rest, faces, matched, mirrored, partner)
         assert (torch.where(labels[:, None], mirrored, matched) - posed).norm(dim=1).max() < 0.03

@@ -51,8 +51,8 @@ def arap_deform(
     CPU meshes are solved one after the other, and memory is proportional to the number of vertices. The connectivity
     of the last few sets of faces is kept between calls; :class:`~meshkit.deform.ARAPTopology`,
     :class:`~meshkit.deform.ARAPRest` and :class:`~meshkit.deform.ARAPFactor` are the parts for one mesh. CUDA tensors
-    stay where they are, and the whole batch is set up and solved at once; iterations run without waiting for the
-    device but for a look, every eight evaluations, at whether all meshes are done (never with ``tol=0``).
+    stay where they are, and the whole batch is set up and solved at once; the host looks now and then whether all
+    meshes are done: L-BFGS every eight evaluations, local-global in every iteration unless ``tol`` is 0, then never.
 
     Args:
         verts: (V, 3) or (B, V, 3) rest positions. Differentiable.

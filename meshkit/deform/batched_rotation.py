@@ -77,6 +77,7 @@ def _cofactors(M: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @cache
+@torch.inference_mode(False)
 def _constants(device: torch.device) -> tuple[Tensor, Tensor]:
     """The linear map (9, 16) from S to Horn's matrix, and the shift (16,) that makes that positive where |S| = 1."""
     basis = torch.eye(9, dtype=torch.float64, device="cpu").view(3, 3, 9)
@@ -87,6 +88,7 @@ def _constants(device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 @cache
+@torch.inference_mode(False)
 def _axial(device: torch.device) -> Tensor:
     """The map (9, 3) from a matrix to the axial vector of its skew part, times two."""
     axial = torch.zeros(9, 3, dtype=torch.float64, device="cpu")

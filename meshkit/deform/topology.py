@@ -124,8 +124,9 @@ class Templates:
 
 
 @cache
+@torch.inference_mode(False)
 def local_templates(energy: str, device: torch.device) -> Templates:
-    """Templates of an energy, as float64 tensors."""
+    """Templates of an energy, as float64 tensors; kept, and so fit for training whoever asks first."""
     # Edge k of a face, opposite corner k, runs from corner k + 2 to corner k + 1.
     eye = torch.eye(3, dtype=torch.float64, device="cpu")
     sign = eye.roll(1, 0) - eye.roll(2, 0)

@@ -36,12 +36,12 @@ def mirror_labels(
 
     with h the mean edge length: edges may not stretch, and both sides change places together, so that they cannot fold
     onto one. The opposite labels give the mirror image, which is no less whole; of the two, that of the larger signed
-    volume has its outside out. Labels that cost the mesh a quarter of its volume have folded it all the same, and are
-    not taken.
+    volume (of the body's own sign) has its outside out. Labels that cost the mesh a quarter of its volume have folded
+    it all the same, and are not taken.
 
     Args:
         verts: ``(N, 3)`` the body.
-        faces: ``(F, 3)`` its faces, outward oriented.
+        faces: ``(F, 3)`` its faces, consistently oriented.
         targets: ``(N, 3)`` matched position of each vertex.
         mirrored: ``(N, 3)`` matched position of each vertex's mirror image.
         partner: ``(N,)`` int64, :math:`\sigma`; need not be an involution.
@@ -93,6 +93,8 @@ def mirror_labels(
     volume, opposite, before, swapped = (
         _volume(torch.where(x[:, None], mirrored, targets), faces) for x in (labels, ~labels, none, ~none)
     )
+    if _volume(verts, faces) < 0:  # faces that look inwards
+        volume, opposite, before, swapped = -volume, -opposite, -before, -swapped
     if opposite > volume:
         labels, volume = ~labels, opposite
     return (none if volume < _WHOLE * max(before, swapped) else labels).to(device)

@@ -71,6 +71,12 @@ def solve_stacked(x: Tensor, y: Tensor, options: Options) -> SamplePlan:
 def split(stack: SamplePlan) -> list[SamplePlan]:
     """The plans one by one, for readings that differ from sample to sample."""
     x, y = stack.kernel.inputs
+    # The first reading may be one without gradient; later ones must find the graph all the same.
+    with torch.inference_mode(False), torch.enable_grad():
+        return _samples(stack, x, y)
+
+
+def _samples(stack: SamplePlan, x: Tensor, y: Tensor) -> list[SamplePlan]:
     return [
         replace(stack, kernel=GibbsKernel(FeatureTiles(x_s, y_s, "kernel"), x_s, y_s), mu=mu, nu=nu, b=b, _sums=None)
         for x_s, y_s, mu, nu, b in zip(x, y, stack.mu, stack.nu, stack.b, strict=True)
