@@ -79,6 +79,7 @@ class Entry:
     # "fullgraph", "forward" (fullgraph, without gradient), "breaks" (with graph breaks) or None (not here)
     compile: str | None = "fullgraph"
     bf16: float = 0.05  # relative deviation allowed under autocast
+    device: float = 1e-8  # and between devices
 
 
 def with_neighbors(inputs: Inputs) -> Inputs:
@@ -198,6 +199,7 @@ ENTRIES = {
         {"a": ["mask"]},
         {"faces": ("a", strip), "handles": ("a", lambda n: torch.arange(0, n, 2))},
         compile=None,  # equal, but its loops are unrolled, which takes minutes
+        device=1e-5,  # rotations are float32 on the CPU, float64 elsewhere
     ),
     "ARAPDeformer-batched": Entry(
         lambda: ARAPDeformer(0.5, max_iter=3, solver="dense"),
@@ -548,4 +550,4 @@ def test_cuda(name):
     on_device = {k: v.cuda() if isinstance(v, Tensor) else v for k, v in inputs.items()}
     result = entry.result(module.cuda()(**on_device))
     assert result.is_cuda
-    assert_near(result.cpu(), expected, 1e-8)
+    assert_near(result.cpu(), expected, entry.device)
