@@ -66,12 +66,11 @@ def rigid_moving_least_squares(
         q = _weights(v.detach(), radius, mask, features)
         # All moments of all neighbourhoods are one product with the weights.
         moments = torch.cat([v, t, (t[..., :, None] * v[..., None, :]).flatten(2)], 2)
-        mean_v, mean_t, outer = (q / q.sum(2, keepdim=True) @ moments).split([3, 3, 9], 2)
+        mean_v, mean_t, outer = (q @ moments / q.sum(2, keepdim=True)).split([3, 3, 9], 2)
         covariance = outer.unflatten(2, (3, 3)) - mean_t[..., :, None] * mean_v[..., None, :]
         rotation = closest_rotation(covariance + _prior(v, t, mask, covariance))
         shift = mean_t - (rotation @ mean_v[..., None])[..., 0]
-        blend = q / q.sum(1, keepdim=True)
-        motion = blend.mT @ torch.cat([rotation.flatten(2), shift], 2)
+        motion = q.mT @ torch.cat([rotation.flatten(2), shift], 2) / q.sum(1)[..., None]
         moved = (motion[..., :9].unflatten(2, (3, 3)) @ v[..., None])[..., 0] + motion[..., 9:]
     return moved.to(target.dtype) if mask is None else moved.to(target.dtype).masked_fill(~mask[..., None], 0.0)
 
@@ -90,12 +89,13 @@ def _prior(v: Tensor, t: Tensor, mask: Tensor | None, covariance: Tensor) -> Ten
 
 
 def _weights(v: Tensor, radius: float, mask: Tensor | None, features: Tensor | None) -> Tensor:
-    q = (1 - torch.cdist(v, v).square() / radius**2).clamp_min(0).square()
+    # In place: these matrices are the largest tensors of a small network's step, and carry no gradient.
+    q = torch.cdist(v, v).square_().mul_(-1 / radius**2).add_(1).clamp_min_(0).square_()
     if features is not None:
         f = features.detach().to(v.dtype)
         if mask is not None:
             f = f.masked_fill(~mask[..., None], 0.0)
-        q = q * torch.exp(-torch.cdist(f, f).square() / f.shape[2])
+        q.mul_(torch.cdist(f, f).square_().mul_(-1 / f.shape[2]).exp_())
     if mask is not None:
         # A padded vertex is its own neighbourhood, so that no sum of weights is zero.
         own = torch.eye(v.shape[1], dtype=torch.bool, device=v.device)
