@@ -11,9 +11,9 @@ from meshkit.batching import center
 from meshkit.data import load_shipped
 from meshkit.metrics import pmd
 from meshkit.models import load_pretrained
-from meshkit.viz import contact_sheet, error_colors, render
+from meshkit.viz import contact_sheet, error_colors, position_colors, render
 
-OUTPUT = Path(__file__).parents[1] / "docs" / "images" / "shipped_weights.png"
+IMAGES = Path(__file__).parents[1] / "docs" / "images"
 WORST = 0.15  # of the error's colours
 ROWS = (  # weights, body, rows of the list of test pairs
     ("corenet3d-humans", "humans", (1, 10)),
@@ -22,31 +22,68 @@ ROWS = (  # weights, body, rows of the list of test pairs
 )
 
 
+EXCHANGED = (62, 48, 83)  # rows where xdualnet-humans takes one lower leg for the other
+
+
+def load_pair(body, row):
+    """Identity mesh, pose mesh and truth of a row of the test pairs."""
+    who, how, other, wanted = row[:, None]
+    return body(who, how), body(other, wanted), body(who, wanted)
+
+
+def together(meshes):
+    """The meshes, centred, and the box of all."""
+    meshes = [center(verts)[0] for verts in meshes]
+    everything = torch.cat(meshes)
+    return meshes, torch.stack([everything.amin(0), everything.amax(0)])
+
+
+def score(result, truth):
+    return f"PMD {1e3 * float(pmd(result[None], truth[None])):.1f}e-3"
+
+
 @torch.no_grad()
-def main() -> None:
+def draw_weights() -> None:
     pictures, captions = [], []
     for name, kind, rows in ROWS:
         net, (body, split) = load_pretrained(name), load_shipped(kind)
-        sides = {"identity_faces": body.faces, "pose_faces": body.faces}
         for row in rows:
-            who, how, other, wanted = split.test_pairs[row][:, None]
-            identity, pose, truth = body(who, how), body(other, wanted), body(who, wanted)
-            output = net.output(identity, pose, **sides)
-            meshes = [center(v)[0] for v in (identity, pose, output.warped, output.vertices, truth)]
-            everything = torch.cat(meshes)
-            bounds = torch.stack([everything.amin(0), everything.amax(0)])
+            identity, pose, truth = load_pair(body, split.test_pairs[row])
+            output = net.output(identity, pose, identity_faces=body.faces, pose_faces=body.faces)
+            meshes, bounds = together([identity, pose, output.warped, output.vertices, truth])
             error = error_colors((meshes[3] - meshes[4]).norm(dim=1), vmax=WORST)
             views = [*((verts, None) for verts in meshes), (meshes[3], error)]
             pictures.append(
                 [render(v, body.faces, colors=colors, bounds=bounds, size=(240, 240)) for v, colors in views]
             )
-            score = 1e3 * float(pmd(meshes[3][None], meshes[4][None]))
-            captions.append([name, "", "", f"PMD {score:.1f}e-3", "", ""])
+            captions.append([name, "", "", score(meshes[3], meshes[4]), "", ""])
     titles = ["identity", "pose", "warped", "output", "ground truth", "error"]
     bar = (0.0, 100 * WORST, "distance to ground truth (cm)")
     sheet = contact_sheet(pictures, column_titles=titles, captions=captions, colorbar=bar)
-    sheet.quantize(128).save(OUTPUT, optimize=True)
+    sheet.quantize(128).save(IMAGES / "shipped_weights.png", optimize=True)
+
+
+@torch.no_grad()
+def draw_exchanged_limbs() -> None:
+    net, (body, split) = load_pretrained("xdualnet-humans"), load_shipped("humans")
+    pictures, captions = [], []
+    for row in EXCHANGED:
+        identity, pose, truth = load_pair(body, split.test_pairs[row])
+        results = []
+        for symmetry in (False, True):
+            net.generator.symmetry = symmetry
+            results.append(net.output(identity, pose, identity_faces=body.faces, pose_faces=body.faces))
+        colors = position_colors(pose[0])
+        meshes, bounds = together([identity, pose, *(r.vertices for r in results), truth])
+        painted = [colors[results[0].plan.argmax()[0]], colors, None, None, None]
+        views = zip(meshes, painted, strict=True)
+        pictures.append([render(v, body.faces, colors=c, bounds=bounds, size=(240, 240)) for v, c in views])
+        captions.append(["matched places", "", score(meshes[2], meshes[4]), score(meshes[3], meshes[4]), ""])
+    titles = ["identity", "pose", "as matched", "symmetry", "ground truth"]
+    sheet = contact_sheet(pictures, column_titles=titles, captions=captions)
+    sheet.quantize(255).save(IMAGES / "exchanged_limbs.png", optimize=True)
 
 
 if __name__ == "__main__":
-    main()
+    draw_weights()
+    draw_exchanged_limbs()
