@@ -35,6 +35,7 @@ from meshkit.transfer import (
 )
 from meshkit.transfer._frames import axis_name, axis_vector, find_scale, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import guess_kind
+from meshkit.transfer._prepare import named
 from meshkit.transfer.command import main
 from meshkit.transfer.confidence import row_entropies
 
@@ -423,6 +424,58 @@ def test_mistakes_are_one_line_and_status_2(words, message, person, tmp_path, mo
     assert caught.value.code == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["id.obj", "poses", "-o", "poses/pose.obj"],
+        ["id.obj", "poses", "-o", "elsewhere/../poses/new.obj"],
+        ["out_0000.obj", "poses", "-o", "out.obj"],
+        ["id.obj", "moves_0000.glb", "-o", "moves.glb"],
+    ],
+)
+def test_many_results_never_overwrite_an_input(words, person, moves, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(choose, "_load", lambda *_: copier(data=None))
+    Path("elsewhere").mkdir()
+    for name in ("id.obj", "out_0000.obj"):
+        save_mesh(name, *person)
+    scene = trimesh.Scene()
+    for number, frame in enumerate(moves[0]):
+        save_mesh(f"poses/pose_{number:04d}.obj", frame, moves[1])
+        scene.add_geometry(trimesh.Trimesh(frame.numpy(), moves[1].numpy(), process=False), node_name=f"f{number}")
+    scene.export("moves_0000.glb")
+    before = {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))}
+    axes = ["--identity-up=+z", "--identity-facing=-y", "--pose-up=+z", "--pose-facing=-y", "--weights", "copy"]
+    with pytest.raises(SystemExit) as caught:
+        command(*words, *axes)
+    error = capsys.readouterr().err
+    assert caught.value.code == 2 and error.count("\n") == 1 and "overwrite" in error
+    assert {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))} == before
+
+
+def test_a_device_without_memory_is_one_line(person, tmp_path, monkeypatch, capsys):
+    def fail(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 8 GiB")
+
+    monkeypatch.setattr("meshkit.transfer.command.transfer_pose", fail)
+    save_mesh(tmp_path / "id.obj", *person)
+    with pytest.raises(SystemExit) as caught:
+        command(tmp_path / "id.obj", tmp_path / "id.obj", "-o", tmp_path / "out.obj")
+    assert caught.value.code == 2
+    assert capsys.readouterr().err == "error: CUDA out of memory. Tried to allocate 8 GiB (on device cpu)\n"
+
+
+def test_any_kind_of_value_error_gets_the_meshs_name():
+    with pytest.raises(ValueError, match="pose: 'utf-8' codec can't decode"):
+        named("pose", lambda: b"\xff".decode())
+    with pytest.raises(MeshFileError, match="pose: m.obj: damaged"):
+        named("pose", lambda: _raise(MeshFileError("m.obj: damaged")))
+
+
+def _raise(error: Exception) -> None:
+    raise error
 
 
 def test_the_command_writes_mesh_picture_and_page(person, mover, tmp_path, monkeypatch, capsys):

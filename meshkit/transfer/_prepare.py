@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from meshkit.io import CleanMesh, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
+from meshkit.io import CleanMesh, MeshFileError, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
 from meshkit.models import PretrainedTransfer
 from meshkit.transfer._frames import DOUBT, Scale, axis_name, find_rotation, find_scale, rotations
 from meshkit.transfer._kinds import rest_body
@@ -168,7 +168,9 @@ def named(name, make):  # type: ignore[no-untyped-def]
     try:
         return make()
     except ValueError as error:
-        raise type(error)(f"{name}: {error}") from error
+        # Other kinds of ValueError, such as UnicodeDecodeError, cannot be made from a text.
+        kind = MeshFileError if isinstance(error, MeshFileError) else ValueError
+        raise kind(f"{name}: {error}") from error
 
 
 def _reference_area(kind: str | None) -> float:
