@@ -353,6 +353,8 @@ def test_files_that_are_no_models_are_named(tmp_path, chumpy):
     (tmp_path / "cut.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:2000])
     (tmp_path / "wrong.npz").write_bytes(b"not a zip file at all")
     np.savez(tmp_path / "objects.npz", **(parts() | {"f": np.array([{}], dtype=object)}))
+    np.savez(tmp_path / "spare.npz", **(parts() | {"training": np.array([{}], dtype=object)}))
+    assert load_smpl(tmp_path / "spare.npz").template.shape == (V, 3)
     (tmp_path / "body.json").write_text("{}")
     for name, message in {
         "missing.pkl": "no such file",

@@ -5,8 +5,10 @@ transfer must be a rigid motion of the identity mesh into the frame and place of
 """
 
 import itertools
+import json
 import math
 import re
+import struct
 import sys
 from pathlib import Path
 
@@ -134,6 +136,15 @@ def test_odd_sizes_are_scaled_to_the_reference():
     assert "scaled by 0.5" in str(giant)
     assert find_scale(1.8 * 1.2**2, 1.8, "m").fit == 1.0
     assert find_scale(1.8 * 7**2, 1.8, None).fit == pytest.approx(1 / (7 * 0.3048))  # nearest as 7 feet
+
+
+def test_animals_are_never_taken_for_feet():
+    animals = load_animals()
+    upright = {"identity_up": "+z", "identity_facing": "-y"}
+    for factor, unit in ((1.0, "m"), (3.0, "m"), (4.5, "m"), (0.3, "m"), (100.0, "cm"), (250.0, "cm")):
+        mesh = (factor * animals.template, animals.faces)
+        scale = PoseTransfer(mesh, weights=copier(data="animals"), **upright).identity.scale
+        assert scale.unit == unit, factor
 
 
 def test_impossible_axes_and_units_are_refused():
@@ -373,6 +384,45 @@ def test_bad_sequences_are_refused(moves, tmp_path):
         read_sequence(tmp_path / "bad.glb")
     with pytest.raises(MeshFileError, match=r"expected floating verts \(T, V, 3\)"):
         read_sequence(tmp_path / "flat.npz")
+
+
+def test_small_files_of_many_poses_do_not_fill_the_memory(moves, tmp_path, monkeypatch):
+    verts, faces = moves
+    mesh = trimesh.Trimesh(verts[0].numpy(), faces.numpy(), process=False)
+    scene = trimesh.Scene()
+    for number in range(40):
+        scene.add_geometry(mesh, node_name=f"{number}", geom_name="one")
+    scene.export(tmp_path / "m.glb")
+    np.savez_compressed(tmp_path / "m.npz", verts=np.zeros((50, 2000, 3), np.float32), faces=faces.numpy())
+    (tmp_path / "claims.glb").write_bytes(_glb_that_claims(10**8))
+    with pytest.raises(MeshFileError, match="an array of 100000000 elements cannot be in a file of"):
+        read_sequence(tmp_path / "claims.glb")
+    monkeypatch.setattr("meshkit.transfer.sequence._MAX_BYTES", 2**20)
+    with pytest.raises(MeshFileError, match="its 40 meshes would take 5 MiB"):
+        read_sequence(tmp_path / "m.glb")
+    with pytest.raises(MeshFileError, match="bytes of poses, more than the 1,048,576 allowed"):
+        read_sequence(tmp_path / "m.npz")
+    monkeypatch.setattr("meshkit.transfer.sequence._MAX_BYTES", 1000)
+    with pytest.raises(MeshFileError, match="bytes, more than the 1,000 allowed"):
+        read_sequence(tmp_path / "m.glb")
+
+
+def _glb_that_claims(count: int) -> bytes:
+    text = json.dumps({"asset": {"version": "2.0"}, "accessors": [{"count": count}]}).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text
+
+
+@pytest.mark.parametrize("axes", [UPRIGHT, {"identity_up": "+z", "identity_facing": "-y", "pose_up": "+z"}])
+def test_sequences_of_weights_without_a_matching(axes, person, moves):
+    """The orientation is the first pose's, given; without it, what the first one says."""
+    poses = [(v, moves[1]) for v in moves[0]]
+    results = transfer_sequence(person, poses, weights=copier(data="humans"), **axes)
+    if axes is UPRIGHT:
+        assert len(list(results)) == 3
+    else:
+        with pytest.raises(ValueError, match="pose 0: these weights have no matching"):
+            list(results)
 
 
 def test_a_sequence_is_as_its_poses_one_by_one(person, moves):

@@ -224,7 +224,7 @@ def _read(path: Path, max_bytes: int) -> tuple[np.ndarray, np.ndarray]:
     size = path.stat().st_size if path.is_file() else 0
     if size > max_bytes:
         raise MeshFileError(f"{path}: {size:,} bytes, more than the {max_bytes:,} allowed (max_file_bytes)")
-    verts, faces = load_mesh(path)
+    verts, faces = load_mesh(path, max_bytes=max_bytes)
     return verts.numpy(), faces.numpy().astype(np.int32)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from meshkit.io import CleanMesh, MeshFileError, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
 from meshkit.models import PretrainedTransfer
-from meshkit.transfer._frames import DOUBT, Scale, axis_name, find_rotation, find_scale, rotations
+from meshkit.transfer._frames import DOUBT, UNITS, Scale, axis_name, find_rotation, find_scale, rotations
 from meshkit.transfer._kinds import rest_body
 
 __all__ = ["Mesh", "Prepared", "prepare", "read"]
@@ -123,7 +123,9 @@ def prepare(
     if clean.changes:
         notes += (f"cleaned: {clean}",)
     net_device = next(net.parameters()).device
-    scale = named(name, lambda: find_scale(_area(clean.verts, clean.faces), _reference_area(kind), unit))
+    among = ("m", "cm", "mm") if kind == "animals" else tuple(UNITS)
+    area = _area(clean.verts, clean.faces)
+    scale = named(name, lambda: find_scale(area, _reference_area(kind), unit, among=among))
     metric = dataclasses.replace(
         clean,
         verts=(clean.verts * scale.factor).float().to(net_device),
