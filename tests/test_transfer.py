@@ -520,7 +520,7 @@ def test_a_device_without_memory_is_one_line(person, tmp_path, monkeypatch, caps
 def test_any_kind_of_value_error_gets_the_meshs_name():
     with pytest.raises(ValueError, match="pose: 'utf-8' codec can't decode"):
         named("pose", lambda: b"\xff".decode())
-    with pytest.raises(MeshFileError, match="pose: m.obj: damaged"):
+    with pytest.raises(MeshFileError, match=r"pose: m\.obj: damaged"):
         named("pose", lambda: _raise(MeshFileError("m.obj: damaged")))
 
 

@@ -2,8 +2,8 @@
 
 A pickle is a program: loading one with :mod:`pickle` runs whatever functions it names. Here every name it may use is
 listed, and each stands for something inert of our own; nothing of NumPy, SciPy or chumpy is called while reading. Any
-other name ends the reading, before it is looked up. What is read stays in proportion to the file: the opcodes are looked
-over before any is carried out, and what copies has a budget.
+other name ends the reading, before it is looked up. What is read stays in proportion to the file: the opcodes are
+looked over before any is carried out, and what copies has a budget.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def read_pickle(path: Path, *, max_bytes: int) -> dict[str, Any]:
     if size > max_bytes:
         raise MeshFileError(f"{path}: {size:,} bytes, more than the {max_bytes:,} allowed (max_bytes)")
     try:
-        # Mapped, because reading a file makes room for as many bytes as the pickle asks for, mapping for those there are.
+        # Reading a file makes room for as many bytes as the pickle asks for; a mapping has those there are.
         with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
             _check(mapped)
             mapped.seek(0)

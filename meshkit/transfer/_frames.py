@@ -119,9 +119,7 @@ class Scale:
         return text if self.fit == 1 else f"{text}, scaled by {self.fit:.3g} to the size that the weights know"
 
 
-def find_scale(
-    area: float, reference_area: float, unit: str | None, *, among: tuple[str, ...] = tuple(UNITS)
-) -> Scale:
+def find_scale(area: float, reference_area: float, unit: str | None, *, among: tuple[str, ...] = tuple(UNITS)) -> Scale:
     """Unit and scale of a body from its surface, which hardly changes with the pose.
 
     The unit is the one in which the body comes nearest to the reference; inches and feet must be clearly nearer. A
