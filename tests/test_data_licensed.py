@@ -5,7 +5,9 @@ import os
 import pickle
 import struct
 import sys
+import tracemalloc
 import types
+from collections import OrderedDict
 from pathlib import Path
 from typing import ClassVar
 
@@ -18,6 +20,7 @@ from scipy.sparse import csc_matrix, csr_matrix
 from scipy.spatial.transform import Rotation
 
 from meshkit.data import SMAL_FAMILIES, Y_UP_TO_Z_UP, load_animals, load_smal, load_smpl, turn_axes
+from meshkit.data._unpickle import read_pickle
 from meshkit.io import MeshFileError
 
 V, J, K = 30, 5, 12
@@ -271,6 +274,56 @@ def test_hand_written_pickles_come_to_nothing(name, tmp_path):
     assert not trap.exists()
 
 
+DTYPE = b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR"
+HUNGRY = {
+    "dtype code that is a container": b"cnumpy\ndtype\n(" + b"(lp0\n" + b"(g0\ng0\nlp0\n" * 30 + b"I0\nI1\ntR.",
+    "byte order that is a container": DTYPE + b"(I3\n(lp0\n" + b"(g0\ng0\nlp0\n" * 30 + b"tb.",
+    "a number for a buffer": b"cnumpy.core.numeric\n_frombuffer\n(I1000000000000\n" + DTYPE + b"(I1\ntS'C'\ntR.",
+    "a number for a scalar": b"cnumpy.core.multiarray\nscalar\n(" + DTYPE + b"I1000000000000\ntR.",
+    "an array's shape in words": b"cnumpy\nndarray\n)\x81(I1\n(S'1'\nt" + DTYPE + b"I00\nS'abcdefgh'\ntb.",
+    "memo slot": b"\x80\x02}r\xff\xff\xff\x7f.",
+    "length of bytes": b"\x80\x04\x8e\x00\x00\x00\x00\x00\x01\x00\x00abc.",
+    "deep tuples": b"\x80\x02})" + 100_000 * b"\x85" + b"Ns.",
+    "deep tuples from the memo": b"\x80\x04})\x94" + b"".join(b"h%c\x85\x94" % k for k in range(200)) + b"Ns.",
+    "deep tuples behind marks": b"\x80\x02}" + 300 * b"(" + 300 * b"t" + b"Ns.",
+    "text encoded over and over": b"\x80\x02]c_codecs\nencode\nq\x01X\xe8\x03\x00\x00" + 1000 * b"a"
+    + b"q\x02h\x02" + b"".join(b"h\x01h\x02\x85R" for _ in range(1000)) + b".",
+    "sets of one list": b"\x80\x02c__builtin__\nset\nq\x01](" + 1000 * b"K\x01" + b"eq\x02"
+    + 1000 * b"h\x01h\x02\x85R" + b".",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HUNGRY)
+def test_small_pickles_take_little_memory(name, tmp_path):
+    path = tmp_path / "body.pkl"
+    path.write_bytes(HUNGRY[name])
+    tracemalloc.start()
+    with pytest.raises(MeshFileError, match=r"body\.pkl: not a readable pickle of arrays \((Unpickling|Value)Error"):
+        load_smpl(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20e6
+
+
+def test_a_container_under_many_keys_is_copied_once(tmp_path):
+    shared = [np.zeros(1)] * 10_000
+    path = tmp_path / "body.pkl"
+    path.write_bytes(pickle.dumps({str(k): shared for k in range(2000)}))
+    content = read_pickle(path, max_bytes=1 << 20)
+    assert content["0"] is content["1999"] and len(content["0"]) == 10_000
+    assert all(part is content["0"][0] or part.shape == (1,) for part in content["0"])
+
+
+def test_deep_enough_tuples_and_ordered_dictionaries_are_read(tmp_path):
+    deep: tuple = ()
+    for _ in range(50):
+        deep = (deep,)
+    path = tmp_path / "body.pkl"
+    for protocol in range(6):
+        path.write_bytes(pickle.dumps(OrderedDict(a={1, 2}, b={deep: 3}, c=b"bytes"), protocol=protocol))
+        assert read_pickle(path, max_bytes=1 << 20) == {"a": {1, 2}, "b": {deep: 3}, "c": b"bytes"}
+
+
 def test_objects_without_state_are_left_alone(tmp_path, chumpy, monkeypatch):
     """An entry that nobody needs may be an object of chumpy that was stored bare."""
     path = write_python2(tmp_path / "body.pkl", published(chumpy, spare=types.SimpleNamespace))
@@ -300,6 +353,8 @@ def test_files_that_are_no_models_are_named(tmp_path, chumpy):
     (tmp_path / "cut.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:2000])
     (tmp_path / "wrong.npz").write_bytes(b"not a zip file at all")
     np.savez(tmp_path / "objects.npz", **(parts() | {"f": np.array([{}], dtype=object)}))
+    np.savez(tmp_path / "spare.npz", **(parts() | {"training": np.array([{}], dtype=object)}))
+    assert load_smpl(tmp_path / "spare.npz").template.shape == (V, 3)
     (tmp_path / "body.json").write_text("{}")
     for name, message in {
         "missing.pkl": "no such file",

@@ -126,6 +126,8 @@ SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
         ("zero.obj", SQUARE + "f 0 1 2\n", "line 5: a face lists three or more vertices, counted from 1"),
         ("cut.obj", SQUARE + "f 1 2", "line 5: a face lists"),
         ("cut2.obj", "v 0 0 0\nv 1 0", "line 2: not enough values"),
+        ("blank.obj", "v 0 0 0\nv \nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "line 2: not enough values"),
+        ("blank2.obj", SQUARE + "f 1 2 3\nf \nf 1 3 4\n", "line 6: a face lists three or more"),
         ("words.obj", "v a b c\n", "line 1: could not convert"),
         ("empty.off", "", "the file ends too early"),
         ("prose.off", "once upon\n", "first word is 'once', not OFF"),

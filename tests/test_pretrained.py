@@ -1,5 +1,6 @@
 """Shipped weights: how they are exported, loaded and called, and that their cards say the truth."""
 
+import importlib
 import json
 import sys
 from dataclasses import asdict, replace
@@ -172,6 +173,8 @@ def test_export_and_load_again(exporter, finished_run, bodies, tmp_path, monkeyp
     assert float((ours - theirs).norm(dim=1).max()) < 1e-3
 
     card = loaded.card
+    assert card["system"] == "X-DualNet (unsupervised)"
+    assert (weights / "tiny-humans.safetensors").stat().st_mode & 0o777 == 0o644
     assert card["figures"] == {"pmd": 50.0, "pmd_copy_identity": 58.0}
     assert card["licence"]["id"] == "Apache-2.0"
     assert len(card["first_pairs_pmd"]) == 8
@@ -186,6 +189,34 @@ def test_export_and_load_again(exporter, finished_run, bodies, tmp_path, monkeyp
     again = xdualnet.parse(xdualnet.PRESETS, None)
     recorded = json.loads((folder / "config.json").read_text())
     assert json.loads(json.dumps(asdict(again), default=str)) == recorded
+
+
+@pytest.mark.parametrize("recipe", ["xdualnet", "corenet3d", "npt", "cycle_baseline"])
+def test_recipes_are_told_apart_by_their_settings(exporter, recipe):
+    module = importlib.import_module(recipe)
+    config = json.loads(json.dumps(asdict(module.PRESETS["tiny"]), default=str))
+    assert exporter.recipe_of(config) == recipe
+    assert exporter.command(config).startswith(f"python recipes/{recipe}.py --preset tiny --data humans --seed 0")
+
+
+def test_a_run_of_no_known_recipe_is_refused(exporter, finished_run, tmp_path, monkeypatch):
+    for path in finished_run[0].iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    config = json.loads((tmp_path / "config.json").read_text())
+    del config["lambda_corr"]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    monkeypatch.setattr(sys, "argv", ["export_weights.py", str(tmp_path), "x", "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit, match="its settings are not those of one of xdualnet, cycle_baseline, npt, coren"):
+        exporter.main()
+
+
+def test_the_cards_that_ship_are_as_the_exporter_writes_them(exporter):
+    assert set(pretrained_names()) == {"corenet3d-humans", "xdualnet-animals", "xdualnet-humans"}
+    for name in pretrained_names():
+        card = json.loads((ROOT / "meshkit" / "weights" / f"{name}.json").read_text())
+        text = (ROOT / "meshkit" / "weights" / f"{name}.md").read_text()
+        assert text == exporter.markdown(name, card)
+        assert ("metres" in text) == (card["data"] == "humans")
 
 
 def test_a_folder_without_a_run_is_refused(exporter, tmp_path, monkeypatch):

@@ -5,8 +5,10 @@ transfer must be a rigid motion of the identity mesh into the frame and place of
 """
 
 import itertools
+import json
 import math
 import re
+import struct
 import sys
 from pathlib import Path
 
@@ -35,6 +37,7 @@ from meshkit.transfer import (
 )
 from meshkit.transfer._frames import axis_name, axis_vector, find_scale, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import guess_kind
+from meshkit.transfer._prepare import named
 from meshkit.transfer.command import main
 from meshkit.transfer.confidence import row_entropies
 
@@ -133,6 +136,15 @@ def test_odd_sizes_are_scaled_to_the_reference():
     assert "scaled by 0.5" in str(giant)
     assert find_scale(1.8 * 1.2**2, 1.8, "m").fit == 1.0
     assert find_scale(1.8 * 7**2, 1.8, None).fit == pytest.approx(1 / (7 * 0.3048))  # nearest as 7 feet
+
+
+def test_animals_are_never_taken_for_feet():
+    animals = load_animals()
+    upright = {"identity_up": "+z", "identity_facing": "-y"}
+    for factor, unit in ((1.0, "m"), (3.0, "m"), (4.5, "m"), (0.3, "m"), (100.0, "cm"), (250.0, "cm")):
+        mesh = (factor * animals.template, animals.faces)
+        scale = PoseTransfer(mesh, weights=copier(data="animals"), **upright).identity.scale
+        assert scale.unit == unit, factor
 
 
 def test_impossible_axes_and_units_are_refused():
@@ -374,6 +386,45 @@ def test_bad_sequences_are_refused(moves, tmp_path):
         read_sequence(tmp_path / "flat.npz")
 
 
+def test_small_files_of_many_poses_do_not_fill_the_memory(moves, tmp_path, monkeypatch):
+    verts, faces = moves
+    mesh = trimesh.Trimesh(verts[0].numpy(), faces.numpy(), process=False)
+    scene = trimesh.Scene()
+    for number in range(40):
+        scene.add_geometry(mesh, node_name=f"{number}", geom_name="one")
+    scene.export(tmp_path / "m.glb")
+    np.savez_compressed(tmp_path / "m.npz", verts=np.zeros((50, 2000, 3), np.float32), faces=faces.numpy())
+    (tmp_path / "claims.glb").write_bytes(_glb_that_claims(10**8))
+    with pytest.raises(MeshFileError, match="an array of 100000000 elements cannot be in a file of"):
+        read_sequence(tmp_path / "claims.glb")
+    monkeypatch.setattr("meshkit.transfer.sequence._MAX_BYTES", 2**20)
+    with pytest.raises(MeshFileError, match="its 40 meshes would take 5 MiB"):
+        read_sequence(tmp_path / "m.glb")
+    with pytest.raises(MeshFileError, match="bytes of poses, more than the 1,048,576 allowed"):
+        read_sequence(tmp_path / "m.npz")
+    monkeypatch.setattr("meshkit.transfer.sequence._MAX_BYTES", 1000)
+    with pytest.raises(MeshFileError, match="bytes, more than the 1,000 allowed"):
+        read_sequence(tmp_path / "m.glb")
+
+
+def _glb_that_claims(count: int) -> bytes:
+    text = json.dumps({"asset": {"version": "2.0"}, "accessors": [{"count": count}]}).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text
+
+
+@pytest.mark.parametrize("axes", [UPRIGHT, {"identity_up": "+z", "identity_facing": "-y", "pose_up": "+z"}])
+def test_sequences_of_weights_without_a_matching(axes, person, moves):
+    """The orientation is the first pose's, given; without it, what the first one says."""
+    poses = [(v, moves[1]) for v in moves[0]]
+    results = transfer_sequence(person, poses, weights=copier(data="humans"), **axes)
+    if axes is UPRIGHT:
+        assert len(list(results)) == 3
+    else:
+        with pytest.raises(ValueError, match="pose 0: these weights have no matching"):
+            list(results)
+
+
 def test_a_sequence_is_as_its_poses_one_by_one(person, moves):
     verts, faces = moves
     poses = [(v + torch.tensor([0.0, 0, float(t)]), faces) for t, v in enumerate(verts)]
@@ -423,6 +474,58 @@ def test_mistakes_are_one_line_and_status_2(words, message, person, tmp_path, mo
     assert caught.value.code == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["id.obj", "poses", "-o", "poses/pose.obj"],
+        ["id.obj", "poses", "-o", "elsewhere/../poses/new.obj"],
+        ["out_0000.obj", "poses", "-o", "out.obj"],
+        ["id.obj", "moves_0000.glb", "-o", "moves.glb"],
+    ],
+)
+def test_many_results_never_overwrite_an_input(words, person, moves, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(choose, "_load", lambda *_: copier(data=None))
+    Path("elsewhere").mkdir()
+    for name in ("id.obj", "out_0000.obj"):
+        save_mesh(name, *person)
+    scene = trimesh.Scene()
+    for number, frame in enumerate(moves[0]):
+        save_mesh(f"poses/pose_{number:04d}.obj", frame, moves[1])
+        scene.add_geometry(trimesh.Trimesh(frame.numpy(), moves[1].numpy(), process=False), node_name=f"f{number}")
+    scene.export("moves_0000.glb")
+    before = {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))}
+    axes = ["--identity-up=+z", "--identity-facing=-y", "--pose-up=+z", "--pose-facing=-y", "--weights", "copy"]
+    with pytest.raises(SystemExit) as caught:
+        command(*words, *axes)
+    error = capsys.readouterr().err
+    assert caught.value.code == 2 and error.count("\n") == 1 and "overwrite" in error
+    assert {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))} == before
+
+
+def test_a_device_without_memory_is_one_line(person, tmp_path, monkeypatch, capsys):
+    def fail(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 8 GiB")
+
+    monkeypatch.setattr("meshkit.transfer.command.transfer_pose", fail)
+    save_mesh(tmp_path / "id.obj", *person)
+    with pytest.raises(SystemExit) as caught:
+        command(tmp_path / "id.obj", tmp_path / "id.obj", "-o", tmp_path / "out.obj")
+    assert caught.value.code == 2
+    assert capsys.readouterr().err == "error: CUDA out of memory. Tried to allocate 8 GiB (on device cpu)\n"
+
+
+def test_any_kind_of_value_error_gets_the_meshs_name():
+    with pytest.raises(ValueError, match="pose: 'utf-8' codec can't decode"):
+        named("pose", lambda: b"\xff".decode())
+    with pytest.raises(MeshFileError, match=r"pose: m\.obj: damaged"):
+        named("pose", lambda: _raise(MeshFileError("m.obj: damaged")))
+
+
+def _raise(error: Exception) -> None:
+    raise error
 
 
 def test_the_command_writes_mesh_picture_and_page(person, mover, tmp_path, monkeypatch, capsys):

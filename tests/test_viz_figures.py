@@ -219,6 +219,14 @@ def script(text: str, name: str) -> str:
     return found[0]
 
 
+def test_marks_in_names_stay_as_they_are(tmp_path: Path) -> None:
+    save_html(tmp_path / "@GLB@.html", {"@GLB@ @TITLE@": (VERTS[0], BODY.faces)}, title="@VIEW@ \\1")
+    text = (tmp_path / "@GLB@.html").read_text()
+    assert "<title>@VIEW@ \\1</title>" in text
+    assert json.loads(script(text, "view"))["names"] == ["@GLB@ @TITLE@"]
+    assert base64.b64decode(script(text, "glb"), validate=True)[:4] == b"glTF"
+
+
 def test_pages_hold_their_meshes_and_need_no_network(page: Path) -> None:
     text = page.read_text()
     assert "<title>two &lt;bodies&gt;</title>" in text

@@ -10,7 +10,9 @@ measuring what is usual on test pairs for the transfer's honesty report.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
+import re
 import sys
 import time
 from dataclasses import asdict
@@ -31,6 +33,19 @@ ROOT = Path(__file__).parents[1]
 WEIGHTS = ROOT / "meshkit" / "weights"
 TOLERANCE = 1e-3  # metres
 MATCHING = ("extractor.", "theta.", "phi.")
+SYSTEMS = {  # by recipe: a setting that no other recipe has, and what the recipe trains
+    "xdualnet": ("lambda_corr", "X-DualNet (unsupervised)"),
+    "cycle_baseline": ("lambda_cycle", "Cycle and self reconstruction (unsupervised)"),
+    "npt": ("variant", "NPT (supervised)"),
+    "corenet3d": ("norm", "3D-CoreNet (supervised)"),
+}
+UNITS = {
+    "humans": ("metres", "m"),
+    "animals": (
+        "the unit of the shipped animals, which is arbitrary (a rest bounding box has a diagonal of 1.5 to 2.1)",
+        "units",
+    ),
+}
 IGNORED = {"preset", "out", "name", "resume", "apply", "result", "threads", "accelerator", "data", "seed", "workers"}
 LICENCES = {
     "humans": {
@@ -110,13 +125,22 @@ def retriangulated(body: Any, identity: int, pose: int) -> tuple[torch.Tensor, t
     return small.verts, small.faces
 
 
+def recipe_of(config: dict[str, Any]) -> str:
+    """The recipe that a run's settings are of.
+
+    Raises:
+        ValueError: none, or several.
+    """
+    found = [name for name, (own, _) in SYSTEMS.items() if own in config]
+    if len(found) != 1:
+        raise ValueError(f"its settings are not those of one of {', '.join(SYSTEMS)}")
+    return found[0]
+
+
 def command(config: dict[str, Any]) -> str:
     """The command that repeats the run: its recipe, preset, and what differs from the preset."""
     sys.path.insert(0, str(ROOT / "recipes"))
-    import corenet3d
-    import xdualnet
-
-    recipe: Any = xdualnet if "lambda_corr" in config else corenet3d
+    recipe: Any = importlib.import_module(recipe_of(config))
     words = [f"python recipes/{recipe.__name__}.py --preset {config['preset']} --data {config['data']}"]
     words.append(f"--seed {config['seed']}")
     preset = json.loads(json.dumps(asdict(recipe.PRESETS[config["preset"]]), default=str))
@@ -148,6 +172,9 @@ def markdown(name: str, card: dict[str, Any]) -> str:
     machine = card["machine"]
     processor = machine["gpu"] or machine["processor"]
     minutes = card["train_minutes"]
+    unit, short = UNITS[card["data"]]
+    moved = card["rounding"]["largest_distance_m"]
+    distance = f"{1e3 * moved:.3f} mm" if short == "m" else f"{moved:.1e} {short}"
     return f"""# {name}
 
 {card["system"]}, preset `{card["preset"]}`, trained on the {card["data"]} that ship with meshkit.
@@ -160,14 +187,14 @@ net = load_pretrained("{name}")
 posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces)  # (V, 3)
 ```
 
-- **Input**: two meshes in metres, z up, facing -y, around {card["vertices"]} vertices each; `meshkit.transfer` brings
-  others there.
+- **Input**: two meshes, z up, facing -y, around {card["vertices"]} vertices each, in {unit};
+  `meshkit.transfer` brings others there.
 - **Training**: `{card["command"]}`
   ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor}, {card["precision"]}, torch
   {machine["torch"]}), finished on {card["date"]}.
 - **Split**: {card["split"]}
 - **Size**: {card["parameters"]:,} parameters, those of the residual blocks stored with 16 bits. Rounding them moves no
-  vertex of {card["rounding"]["pairs"]} test pairs by more than {1e3 * card["rounding"]["largest_distance_m"]:.3f} mm.
+  vertex of {card["rounding"]["pairs"]} test pairs by more than {distance}.
 - **Licence**: {card["licence"]["id"]}. {card["licence"]["note"]}
 
 ## Figures
@@ -210,6 +237,7 @@ def main() -> None:
             json.loads((args.run / f"{part}.json").read_text()) for part in ("config", "summary", "machine")
         )
         body, split = load_shipped(config["data"], config["vertices"])
+        system = SYSTEMS[recipe_of(config)][1]
     except (OSError, ValueError) as error:
         raise SystemExit(f"error: {args.run} is not a finished run on shipped bodies: {error}") from None
     state = rounded(generator.state_dict(), {key for key, _ in generator.named_parameters()})
@@ -223,7 +251,7 @@ def main() -> None:
         raise SystemExit(f"error: 16-bit parameters move vertices by {distance:.2e}, more than {TOLERANCE:g} metres")
     card = {
         "name": args.name,
-        "system": "X-DualNet (unsupervised)" if "lambda_corr" in config else "3D-CoreNet (supervised)",
+        "system": system,
         "preset": config["preset"],
         "command": command(config),
         "seed": config["seed"],
@@ -238,7 +266,7 @@ def main() -> None:
         "date": time.strftime("%Y-%m-%d", time.gmtime((args.run / "summary.json").stat().st_mtime)),
         "figures": summary["test"],
         "test_pairs": summary["test_pairs"],
-        "units": summary["units"],
+        "units": re.sub(r"\bm\b", UNITS[config["data"]][1], summary["units"]),
         "parameters": summary["parameters"],
         "machine": machine,
         "licence": LICENCES[config["data"]],
@@ -250,6 +278,7 @@ def main() -> None:
     }
     with atomic_write(args.out / f"{args.name}.safetensors") as path:
         save_file(state, path)
+        path.chmod(0o644)  # safetensors makes files that only their owner can read
     for suffix, text in ((".json", json.dumps(card, indent=2) + "\n"), (".md", markdown(args.name, card))):
         with atomic_write(args.out / f"{args.name}{suffix}") as path:
             path.write_text(text, encoding="utf-8")

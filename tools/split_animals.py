@@ -12,6 +12,8 @@ from importlib.resources import files
 
 import numpy as np
 
+from meshkit.io import atomic_write
+
 TEST_FAMILIES = ("felidae", "canidae")
 TEST_POSES = 60
 PAIRS = 400
@@ -45,8 +47,8 @@ def main() -> None:
         "test_poses": sorted(test_poses),
         "test_pairs": pairs,
     }
-    with open(path, "w") as stream:
-        stream.write(json.dumps(table) + "\n")
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(table) + "\n", encoding="utf-8")
     print(f"{len(animals)} of {len(families)} animals and {len(test_poses)} of {len(tags)} poses to test on")
 
 

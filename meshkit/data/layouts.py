@@ -132,12 +132,17 @@ def read_test_list(path: str | os.PathLike[str], entries: Iterable[MeshEntry]) -
         ``(identity, pose, ground_truth)`` per line.
 
     Raises:
-        MeshFileError: no such file, an empty list, a line of other than three names, or a mesh that is not there.
+        MeshFileError: no such file, an empty list, a line of other than three names, a mesh that is not there, or one
+            of a name that several entries have.
     """
     path = Path(path)
     if not path.is_file():
         raise MeshFileError(f"{path}: no such file")
-    places = {entry.path.name: k for k, entry in enumerate(entries)}
+    places: dict[str, int] = {}
+    repeated: set[str] = set()
+    for k, entry in enumerate(entries):
+        if places.setdefault(entry.path.name, k) != k:
+            repeated.add(entry.path.name)
     rows = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
         names = line.split()
@@ -148,6 +153,8 @@ def read_test_list(path: str | os.PathLike[str], entries: Iterable[MeshEntry]) -
         missing = [name for name in names if name not in places]
         if missing:
             raise MeshFileError(f"{path}: line {number} names {missing[0]!r}, which none of {len(places)} meshes is")
+        if twice := [name for name in names if name in repeated]:
+            raise MeshFileError(f"{path}: line {number} names {twice[0]!r}, and several meshes are called that")
         a, b, truth = (places[name] for name in names)
         rows.append((a, b, truth))
     if not rows:

@@ -22,6 +22,9 @@ SMAL_FAMILIES = ("felidae", "canidae", "equidae", "bovidae", "hippopotamidae")
 
 MAX_BYTES = 1 << 30
 
+_MODEL = ("v_template", "kintree_table", "f", "shapedirs", "posedirs", "weights", "J_regressor")
+_ANIMALS = ("toys_betas", "cluster_means")
+
 
 def load_smpl(
     path: str | os.PathLike[str], *, num_betas: int | None = 10, z_up: bool = False, max_bytes: int = MAX_BYTES
@@ -55,7 +58,7 @@ def load_smpl(
         torch.Size([1, 6890, 3])
     """
     path = Path(path)
-    content = _read(path, max_bytes)
+    content = _read(path, max_bytes, _MODEL)
     template = _array(content, "v_template", path)
     num = len(template)
     table = _array(content, "kintree_table", path)
@@ -123,7 +126,7 @@ def load_smal(
     if data_path is None:
         return model
     path = Path(data_path)
-    content, count = _read(path, max_bytes), len(model.shape_dirs)
+    content, count = _read(path, max_bytes, _ANIMALS), len(model.shape_dirs)
     toys = _rows(content, "toys_betas", path, count)
     means = _rows(content, "cluster_means", path, count)
     families = [SMAL_FAMILIES[k] if k < len(SMAL_FAMILIES) else f"family_{k}" for k in range(len(means))]
@@ -132,7 +135,8 @@ def load_smal(
     return model
 
 
-def _read(path: Path, max_bytes: int) -> dict[str, Any]:
+def _read(path: Path, max_bytes: int, wanted: tuple[str, ...]) -> dict[str, Any]:
+    """What is in a file; of an ``.npz`` only what is wanted, as the rest may be objects that cannot be read."""
     if not path.is_file():
         raise MeshFileError(f"{path}: {'a folder, not a model file' if path.is_dir() else 'no such file'}")
     if path.suffix == ".pkl":
@@ -142,10 +146,11 @@ def _read(path: Path, max_bytes: int) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             # The sizes of the arrays, not of the compressed file: a small file can unpack to anything.
-            size = sum(entry.file_size for entry in archive.zip.infolist())
+            names = [key for key in wanted if key in archive.files]
+            size = sum(archive.zip.getinfo(f"{key}.npy").file_size for key in names)
             if size > max_bytes:
                 raise MeshFileError(f"{path}: {size:,} bytes, more than the {max_bytes:,} allowed (max_bytes)")
-            return {key: archive[key] for key in archive.files if archive.zip.getinfo(f"{key}.npy").file_size}
+            return {key: archive[key] for key in names}
     except MeshFileError:
         raise
     except Exception as error:  # zipfile, zlib and NumPy each have their own ways to fail

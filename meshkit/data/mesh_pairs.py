@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -40,7 +41,8 @@ class MeshPairs(Dataset[PairBatch]):
         pose_noise: standard deviation of normal noise on the pose mesh, in the unit of the files, before centring.
         window: stream: draw each part of an epoch from this many shards, in an order that changes from epoch to epoch.
             Memory then holds these shards and disks are read in sequence, however large the store; give
-            :class:`~meshkit.data.PairSampler` ``shuffle=False``, so that parts follow each other.
+            :class:`~meshkit.data.PairSampler` ``shuffle=False``, so that parts follow each other. A part in which no
+            two meshes share a pose gives only pairs whose pose mesh is the ground truth, with a warning.
 
     Raises:
         ValueError: a length or window below 1, negative noise, less than two meshes, no ground truth in the store,
@@ -164,6 +166,12 @@ class MeshPairs(Dataset[PairBatch]):
                 shards = order[part * self.window : (part + 1) * self.window]
                 members = torch.isin(self.store.shard, shards).nonzero()[:, 0]
                 self._choice = ((epoch, part), _Choice(self.store, members))
+                if self.ground_truth and not self._choice[1].has_pairs():
+                    warnings.warn(
+                        f"no pose is shared by two meshes in {self.window} shards of {self.num_shards}: the pose mesh "
+                        "will be the ground truth; make window or shard_bytes larger",
+                        stacklevel=2,
+                    )
             choice = self._choice[1]
         seeded(dice, self.seed, epoch, i)
         return choice.with_truth(dice) if self.ground_truth else (*choice.any_two(dice), -1)

@@ -20,7 +20,7 @@ from meshkit.io import MeshFileError, atomic_write, load_mesh
 
 __all__ = ["MeshStore"]
 
-_FORMAT = 2
+_FORMAT = 3
 _OPEN_MAPS = 64
 
 
@@ -28,7 +28,8 @@ class MeshStore:
     """Meshes in shards of ``.npy`` files, read through memory maps: any number of them, in little memory.
 
     :meth:`build` parses the files once, with a progress bar, and writes the shards; later calls with the same files
-    (by name, size and time of change) open what is there. Identical face lists are stored once per shard.
+    (by name, size and time of change) open what is there. Identical face lists are stored once per shard. Meshes are
+    spread over the shards at random, always alike, so that a few shards hold many identities and poses.
 
     Args:
         cache: folder that :meth:`build` filled.
@@ -124,32 +125,44 @@ class MeshStore:
         (cache / "index.json").unlink(missing_ok=True)  # without an index, what follows is no store until it is whole
         for stale in (*cache.glob("verts-*.npy"), *cache.glob("faces-*.npy")):
             stale.unlink()
-        rows: list[list[int]] = []
-        paths: list[str] = []
-        centers: list[list[float]] = []
-        skipped: list[tuple[str, str]] = []
+        stored: dict[int, tuple[list[int], list[float]]] = {}
+        bad: dict[int, tuple[str, str]] = {}
         topologies: dict[bytes, int] = {}
         shard = _Shard(cache, 0)
-        for entry in tqdm(entries, desc="meshes", unit="mesh", disable=not progress, dynamic_ncols=True):
+        order = torch.randperm(len(entries), generator=torch.Generator().manual_seed(0)).tolist()
+        for k in tqdm(order, desc="meshes", unit="mesh", disable=not progress, dynamic_ncols=True):
+            entry = entries[k]
             try:
                 verts, faces = _read(entry.path, max_file_bytes)
             except MeshFileError as error:
                 if not skip_bad:
                     raise
-                skipped.append((str(entry.path), str(error)))
+                bad[k] = (str(entry.path), str(error))
                 continue
             digest = hashlib.sha256(faces.tobytes() + len(verts).to_bytes(8, "little")).digest()
             topology = topologies.setdefault(digest, len(topologies))
-            rows.append([entry.identity, entry.pose, topology, shard.number, *shard.add(verts, faces, topology)])
-            paths.append(str(entry.path))
-            centers.append(((verts.min(0) + verts.max(0)) / 2).tolist())
+            row = [entry.identity, entry.pose, topology, shard.number, *shard.add(verts, faces, topology)]
+            stored[k] = (row, ((verts.min(0) + verts.max(0)) / 2).tolist())
             if shard.size >= shard_bytes:
                 shard.write()
                 shard = _Shard(cache, shard.number + 1)
-        if not rows:
+        skipped = [bad[k] for k in sorted(bad)]
+        if not stored:
             raise MeshFileError(f"none of the {len(entries)} files could be read, the first: {skipped[0][1]}")
         shard.write()
-        index = {"format": _FORMAT, "key": key, "rows": rows, "paths": paths, "centers": centers, "skipped": skipped}
+        places = sorted(stored)  # as the entries came
+        first: dict[int, int] = {}
+        rows = [stored[k][0] for k in places]
+        for row in rows:
+            row[2] = first.setdefault(row[2], len(first))
+        index = {
+            "format": _FORMAT,
+            "key": key,
+            "rows": rows,
+            "paths": [str(entries[k].path) for k in places],
+            "centers": [stored[k][1] for k in places],
+            "skipped": skipped,
+        }
         with atomic_write(cache / "index.json") as temporary:
             temporary.write_text(json.dumps(index))
         if skipped:
@@ -224,7 +237,7 @@ def _read(path: Path, max_bytes: int) -> tuple[np.ndarray, np.ndarray]:
     size = path.stat().st_size if path.is_file() else 0
     if size > max_bytes:
         raise MeshFileError(f"{path}: {size:,} bytes, more than the {max_bytes:,} allowed (max_file_bytes)")
-    verts, faces = load_mesh(path)
+    verts, faces = load_mesh(path, max_bytes=max_bytes)
     return verts.numpy(), faces.numpy().astype(np.int32)
 
 

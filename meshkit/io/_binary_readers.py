@@ -16,15 +16,7 @@ def read_binary(path: Path, limit: int) -> Parsed:
     import trimesh
 
     extension = path.suffix.lower()
-    if extension in (".glb", ".stl"):
-        (_check_glb if extension == ".glb" else _check_stl)(path)
-    # fix_texture would repeat the vertices of a PLY along its texture seams.
-    options: dict[str, Any] = {"fix_texture": False} if extension == ".ply" else {}
-    scene = trimesh.load_scene(path, process=False, **options)
-    uses = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
-    bytes_needed = 24 * sum(len(part.vertices) + len(getattr(part, "faces", ())) for part in uses)
-    if bytes_needed > max(limit, 2**20):  # a small file can place one mesh many times
-        raise ValueError(f"its {len(uses)} meshes would take {bytes_needed / 2**20:,.0f} MiB, more than max_bytes")
+    scene = read_scene(path, limit)
     parts = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh | trimesh.PointCloud)]
     if not parts:
         raise ValueError("no mesh in it")
@@ -35,6 +27,23 @@ def read_binary(path: Path, limit: int) -> Parsed:
     if extension == ".stl":
         return Parsed(*_weld(verts, faces))
     return Parsed(verts, faces, _check_ply(path, verts, faces) if extension == ".ply" else 0)
+
+
+def read_scene(path: Path, limit: int) -> Any:
+    """The trimesh scene of a PLY, STL or GLB file, whose meshes in their places take no more than ``limit`` bytes."""
+    import trimesh
+
+    extension = path.suffix.lower()
+    if extension in (".glb", ".stl"):
+        (_check_glb if extension == ".glb" else _check_stl)(path)
+    # fix_texture would repeat the vertices of a PLY along its texture seams.
+    options: dict[str, Any] = {"fix_texture": False} if extension == ".ply" else {}
+    scene = trimesh.load_scene(path, process=False, **options)
+    uses = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
+    bytes_needed = 24 * sum(len(part.vertices) + len(getattr(part, "faces", ())) for part in uses)
+    if bytes_needed > max(limit, 2**20):  # a small file can place one mesh many times
+        raise ValueError(f"its {len(uses)} meshes would take {bytes_needed / 2**20:,.0f} MiB, more than max_bytes")
+    return scene
 
 
 def _check_ply(path: Path, verts: Points, faces: Indices) -> int:

@@ -88,6 +88,8 @@ def _obj_batch(batch: list[bytes], mesh: _Growing) -> None:
     if face:
         block = b"".join(face)
         polygons = _table((_SLASHES.sub(b"", block) if b"/" in block else block).splitlines(), np.int64)
+    if len(verts) != len(vertex) or len(polygons) != len(face):
+        raise ValueError("a vertex or a face of nothing, which would shift the indices")
     if polygons.shape[1] < 3 or (len(polygons) and polygons.min() < 1):
         raise ValueError("short faces or relative indices")
     mesh.add_verts(verts)

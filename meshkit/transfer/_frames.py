@@ -119,7 +119,7 @@ class Scale:
         return text if self.fit == 1 else f"{text}, scaled by {self.fit:.3g} to the size that the weights know"
 
 
-def find_scale(area: float, reference_area: float, unit: str | None) -> Scale:
+def find_scale(area: float, reference_area: float, unit: str | None, *, among: tuple[str, ...] = tuple(UNITS)) -> Scale:
     """Unit and scale of a body from its surface, which hardly changes with the pose.
 
     The unit is the one in which the body comes nearest to the reference; inches and feet must be clearly nearer. A
@@ -129,6 +129,7 @@ def find_scale(area: float, reference_area: float, unit: str | None) -> Scale:
         area: of the surface, in the file's unit squared.
         reference_area: of the mean training body, in square metres.
         unit: of the file, if it is known.
+        among: units to guess among. Bodies that differ as much in size as a mouse and a horse say little about theirs.
 
     Raises:
         ValueError: no area, or an unknown unit.
@@ -142,7 +143,7 @@ def find_scale(area: float, reference_area: float, unit: str | None) -> Scale:
     def distance(name: str) -> float:
         return abs(excess + math.log(UNITS[name])) + (_RARE if name in ("in", "ft") else 0.0)
 
-    chosen = unit or min(UNITS, key=distance)
+    chosen = unit or min(among, key=distance)
     left = excess + math.log(UNITS[chosen])
     return Scale(chosen, UNITS[chosen], 1.0 if abs(left) <= _NEAR else math.exp(-left), unit is not None)
 

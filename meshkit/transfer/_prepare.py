@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from meshkit.io import CleanMesh, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
+from meshkit.io import CleanMesh, MeshFileError, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
 from meshkit.models import PretrainedTransfer
-from meshkit.transfer._frames import DOUBT, Scale, axis_name, find_rotation, find_scale, rotations
+from meshkit.transfer._frames import DOUBT, UNITS, Scale, axis_name, find_rotation, find_scale, rotations
 from meshkit.transfer._kinds import rest_body
 
 __all__ = ["Mesh", "Prepared", "prepare", "read"]
@@ -123,7 +123,9 @@ def prepare(
     if clean.changes:
         notes += (f"cleaned: {clean}",)
     net_device = next(net.parameters()).device
-    scale = named(name, lambda: find_scale(_area(clean.verts, clean.faces), _reference_area(kind), unit))
+    among = ("m", "cm", "mm") if kind == "animals" else tuple(UNITS)
+    area = _area(clean.verts, clean.faces)
+    scale = named(name, lambda: find_scale(area, _reference_area(kind), unit, among=among))
     metric = dataclasses.replace(
         clean,
         verts=(clean.verts * scale.factor).float().to(net_device),
@@ -168,7 +170,9 @@ def named(name, make):  # type: ignore[no-untyped-def]
     try:
         return make()
     except ValueError as error:
-        raise type(error)(f"{name}: {error}") from error
+        # Other kinds of ValueError, such as UnicodeDecodeError, cannot be made from a text.
+        kind = MeshFileError if isinstance(error, MeshFileError) else ValueError
+        raise kind(f"{name}: {error}") from error
 
 
 def _reference_area(kind: str | None) -> float:

@@ -1,6 +1,7 @@
 """The console script ``meshkit-transfer``: the pose of one mesh file for the body of another."""
 
 import argparse
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -68,6 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail(f"{error.filename or 'file'}: {error.strerror or error}")
     except (ValueError, ImportError) as error:
         _fail(str(error))
+    except RuntimeError as error:  # of PyTorch: a device that is missing or has too little memory
+        _fail(f"{str(error) or type(error).__name__} (on device {args.device})")
 
 
 def _fail(message: str) -> None:
@@ -81,8 +84,7 @@ def run(args: argparse.Namespace) -> None:
     suffix = args.out.suffix.lower()
     if suffix not in (*_FORMATS, *((".npz",) if many else ())):
         raise MeshFileError(f"{args.out}: the result is written as {', '.join(_FORMATS)}{' or .npz' if many else ''}")
-    if args.out.resolve() in (args.identity.resolve(), args.pose.resolve()):
-        raise ValueError(f"{args.out} would overwrite an input: choose another --out")
+    _check_inputs_are_safe(args, many)
     options: dict[str, Any] = {
         name: getattr(args, name) for name in ("weights", "frame", "device") if getattr(args, name) is not None
     }
@@ -100,6 +102,16 @@ def run(args: argparse.Namespace) -> None:
         save_picture(args.out.with_suffix(".png"), shown)
     if not args.no_html:
         save_page(args.out.with_suffix(".html"), shown[-1])
+
+
+def _check_inputs_are_safe(args: argparse.Namespace, many: bool) -> None:
+    """Refuse to write over what is read. Of many results it is not known how many there will be."""
+    out, inputs = args.out.resolve(), (args.identity.resolve(), args.pose.resolve())
+    if many and out.parent == inputs[1]:
+        raise ValueError(f"{args.out} lies among the poses and could overwrite them: choose an --out in another folder")
+    numbered = re.compile(rf"{re.escape(out.stem)}_\d{{4,}}{re.escape(out.suffix)}")
+    if out in inputs or (many and any(p.parent == out.parent and numbered.fullmatch(p.name) for p in inputs)):
+        raise ValueError(f"{args.out} would overwrite an input: choose another --out")
 
 
 def _write_sequence(results: Iterator[TransferResult], args: argparse.Namespace) -> list[TransferResult]:

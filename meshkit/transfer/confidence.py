@@ -1,4 +1,4 @@
-"""How far a transfer is from what the weights know: four numbers of it, against those of ordinary pairs."""
+"""How far a transfer is from what the weights know: five numbers of it, against those of ordinary pairs."""
 
 from __future__ import annotations
 

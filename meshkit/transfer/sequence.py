@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from meshkit.io import MeshFileError, SurfaceBinding
+from meshkit.io._binary_readers import read_scene
 from meshkit.transfer._choose import Weights
 from meshkit.transfer._frames import find_rotation, turns_about
 from meshkit.transfer._kinds import rest_body
@@ -22,6 +23,7 @@ from meshkit.transfer.transfer import PoseTransfer
 
 __all__ = ["is_sequence", "read_sequence", "transfer_sequence"]
 
+_MAX_BYTES = 2**30  # of the arrays of a file of many poses
 _FORMATS = {".obj", ".ply", ".off", ".stl", ".glb"}
 
 
@@ -45,7 +47,7 @@ def read_sequence(path: str | os.PathLike[str]) -> list[Mesh]:
     nodes.
 
     Raises:
-        MeshFileError: there is nothing there, or not what is described here.
+        MeshFileError: there is nothing there, or not what is described here; or poses of more than 1 GiB in one file.
     """
     path = Path(path)
     if path.is_dir():
@@ -72,6 +74,10 @@ def _natural(name: str) -> list[Any]:
 def _npz_meshes(path: Path) -> list[tuple[Tensor, Tensor]]:
     try:
         with np.load(path, allow_pickle=False) as archive:
+            # The sizes of the arrays, not of the compressed file: a small file can unpack to anything.
+            wanted = [entry for entry in archive.zip.infolist() if entry.filename in ("verts.npy", "faces.npy")]
+            if (size := sum(entry.file_size for entry in wanted)) > _MAX_BYTES:
+                raise ValueError(f"{size:,} bytes of poses, more than the {_MAX_BYTES:,} allowed")
             arrays = {name: archive[name] for name in ("verts", "faces")}
     except Exception as error:  # zipfile, zlib, KeyError and ValueError, depending on the damage
         raise MeshFileError(f"{path}: not an .npz file with arrays verts and faces ({error})") from error
@@ -90,8 +96,10 @@ def _glb_meshes(path: Path) -> list[tuple[Tensor, Tensor]]:
     """The meshes of a scene by the names of their nodes, if all have equal faces; else none."""
     import trimesh
 
+    if (size := path.stat().st_size) > _MAX_BYTES:
+        raise MeshFileError(f"{path}: {size:,} bytes, more than the {_MAX_BYTES:,} allowed")
     try:
-        scene = trimesh.load_scene(path, process=False)
+        scene = read_scene(path, _MAX_BYTES)
         nodes = sorted(scene.graph.nodes_geometry, key=_natural)
         placed = [(scene.geometry[geometry], place) for place, geometry in map(scene.graph.get, nodes)]
         parts = [part.copy().apply_transform(place) for part, place in placed if isinstance(part, trimesh.Trimesh)]
@@ -123,7 +131,8 @@ def transfer_sequence(
     Work on the identity mesh is done once. Where the pose meshes share their faces, so is the cleaning and simplifying
     of the first one, and the others' vertices follow it; then also unit and size are those of the first. The
     orientation of each is sought among the previous one's and the quarter turns next to it, so that a body may turn
-    around during a sequence. Every pose is transferred by itself: nothing is smoothed over time.
+    around during a sequence; it stays that of the first where ``pose_up`` and ``pose_facing`` are both given, or the
+    weights have no matching to find it with. Every pose is transferred by itself: nothing is smoothed over time.
 
     Args:
         identity: the mesh that gives the body; see :func:`transfer_pose`.
@@ -176,7 +185,7 @@ def transfer_sequence(
             current = follower.follow(transfer, name, verts, before)
         else:
             current = transfer.prepare_pose((verts, faces), name, unit=pose_unit, up=pose_up, facing=pose_facing)
-            follower = _Follower(current, verts)
+            follower = _Follower(current, verts, turns=pose_up is None or pose_facing is None)
         first = first or current
         before = current
         with torch.no_grad():
@@ -186,8 +195,8 @@ def transfer_sequence(
 class _Follower:
     """Later poses of the mesh that was prepared first: the same cleaning and the same simple vertices."""
 
-    def __init__(self, first: Prepared, verts: Tensor) -> None:
-        self._first, self._num_verts = first, len(verts)
+    def __init__(self, first: Prepared, verts: Tensor, *, turns: bool) -> None:
+        self._first, self._num_verts, self._turns = first, len(verts), turns
         clean, simple = first.clean, first.simple
         self._binding = SurfaceBinding(simple.verts, simple.faces, clean.verts, clean.faces)
 
@@ -203,7 +212,7 @@ class _Follower:
         small = clean.verts if first.simple.method == "none" else self._binding.carry(clean.verts)
         simple = replace(first.simple, verts=small, original=clean.verts)
         rotation = before.rotation
-        if transfer.kind is not None:
+        if self._turns and transfer.kind is not None and hasattr(transfer.net.generator, "match"):
             rotation, _ = named(
                 name,
                 lambda: find_rotation(

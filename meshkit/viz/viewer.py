@@ -4,6 +4,7 @@ import base64
 import html
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -80,13 +81,14 @@ def save_html(
         "flat": False,
     }
     page = (files("meshkit.viz") / "viewer.html").read_text(encoding="utf-8")
-    for mark, text in {
-        "@TITLE@": html.escape(title),
-        "@FILE@": html.escape(Path(path).with_suffix(".glb").name),
-        "@VIEW@": json.dumps(view).replace("<", "\\u003c"),  # a name cannot end the script
-        "@GLB@": base64.b64encode(glb).decode("ascii"),
-    }.items():
-        page = page.replace(mark, text)
+    texts = {
+        "TITLE": html.escape(title),
+        "FILE": html.escape(Path(path).with_suffix(".glb").name),
+        "VIEW": json.dumps(view).replace("<", "\\u003c"),  # a name cannot end the script
+        "GLB": base64.b64encode(glb).decode("ascii"),
+    }
+    # In one pass, so that a mark in a name stays as it is.
+    page = re.sub("@(TITLE|FILE|VIEW|GLB)@", lambda mark: texts[mark[1]], page)
     with atomic_write(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
