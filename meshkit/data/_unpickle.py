@@ -50,7 +50,7 @@ class _DType:
 
     def __setstate__(self, state: Any) -> None:
         order = _text(state[1])
-        self.dtype = self.dtype.newbyteorder(order if order in ("<", ">") else "=")
+        self.dtype = self.dtype.newbyteorder("<" if order == "<" else ">" if order == ">" else "=")
 
 
 class Array:
@@ -170,7 +170,7 @@ def _check(stream: Any) -> None:
     for number, (opcode, argument, _) in enumerate(pickletools.genops(stream), 1):
         name = opcode.name
         if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
-            slot = len(memo) if name == "MEMOIZE" else int(argument)
+            slot = len(memo) if name == "MEMOIZE" else int(str(argument))
             if slot > number:
                 raise pickle.UnpicklingError(f"memo slot {slot} in opcode {number}")
             memo[slot] = (stack[-1] if stack else 0) or 0
@@ -188,7 +188,7 @@ def _check(stream: Any) -> None:
             continue
         depth = 0
         if name in ("GET", "BINGET", "LONG_BINGET"):
-            depth = memo.get(int(argument), 0)
+            depth = memo.get(int(str(argument)), 0)
         elif name == "DUP":
             depth = max(taken)
         elif name in ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"):
