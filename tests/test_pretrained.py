@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 
 import meshkit.models.pretrained as pretrained
 from meshkit.batching import bounding_box_center, center
-from meshkit.data import load_shipped
+from meshkit.data import load_humans, load_shipped
 from meshkit.descriptors import intrinsic_descriptors
 from meshkit.metrics import pmd
 from meshkit.models import GeneratorConfig, PretrainedTransfer, load_pretrained, pretrained_names
@@ -277,3 +277,18 @@ def test_figures_come_out_again(name):
         scores.append(1e3 * float(pmd(posed[None], center(truth[None]))[0]))
     # 5 % and a little: 16-bit parameters, and eigenvectors that differ with the libraries.
     assert sum(scores) / len(scores) == pytest.approx(sum(recorded) / len(recorded), rel=0.05, abs=0.02)
+
+
+@pytest.mark.parametrize("scale", [100.0, 1e-3])
+def test_shipped_weights_refuse_what_cannot_be_metres(scale):
+    net, body = load_pretrained("corenet3d-humans"), load_humans(1000)
+    with pytest.raises(ValueError, match=r"identity is .* long, but these weights take .*transfer_pose"):
+        net(scale * body.template, body.template, identity_faces=body.faces, pose_faces=body.faces)
+
+
+def test_shipped_weights_take_float64():
+    net, body = load_pretrained("corenet3d-humans"), load_humans(1000)
+    sides = {"identity_faces": body.faces, "pose_faces": body.faces}
+    a, b = body(torch.tensor([1, 2]), torch.tensor([3, 4]))
+    with torch.no_grad():
+        assert (net(a.double(), b.double(), **sides) - net(a, b, **sides)).abs().max() < 1e-3

@@ -16,6 +16,8 @@ from meshkit.models.npt import NPT
 from meshkit.models.output import GeneratorOutput
 from meshkit.models.presets import GeneratorConfig
 
+_SMALLEST, _LARGEST = 0.1, 20.0  # extents of meshes, or of all poses of a batch together, that may be in metres
+
 __all__ = ["PretrainedTransfer", "load_pretrained", "pretrained_names"]
 
 
@@ -39,8 +41,8 @@ class PretrainedTransfer(nn.Module):
         ``(V, 3)`` if both are single meshes, else ``(B, V, 3)``.
 
     Raises:
-        ValueError: wrong shapes, unequal batches, fewer vertices than the network looks at, or no faces where the
-            weights use descriptors.
+        ValueError: a size that cannot be metres (shipped weights), wrong shapes, unequal batches, fewer vertices than
+            the network looks at, or no faces where the weights use descriptors.
 
     Example:
         >>> config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16))
@@ -120,7 +122,14 @@ class PretrainedTransfer(nn.Module):
         """What the generator is told of one of the two meshes, or batches of meshes."""
         if verts.dim() not in (2, 3) or verts.shape[-1] != 3:
             raise ValueError(f"{name} must be (V, 3) or (B, V, 3), got {tuple(verts.shape)}")
-        verts = verts if verts.dim() == 3 else verts[None]
+        verts = (verts if verts.dim() == 3 else verts[None]).to(next(self.generator.parameters()).dtype)
+        real = verts.detach() if mask is None else verts.detach()[mask]
+        extent = float((real.flatten(0, -2).amax(0) - real.flatten(0, -2).amin(0)).amax()) if real.numel() else 0.0
+        if self.card and not _SMALLEST < extent < _LARGEST:
+            raise ValueError(
+                f"{name} is {extent:.3g} long, but these weights take meshes of about 1 to 2 (metres, z up, facing "
+                "-y): meshkit.transfer.transfer_pose brings others there"
+            )
         k = self.config.k if self.config.architecture == "matching" and self.config.extractor == "setconv" else 1
         if verts.shape[1] < k:
             raise ValueError(f"{name} has {verts.shape[1]} vertices; these weights look at {k} neighbours of each")
