@@ -1,8 +1,8 @@
 """Make the shipped animals, ``animals_baked.npz``, again from the art of the game 0 A.D.
 
-Needs the game's data, 1.4 GB, and for the registration igl, trimesh and pymeshlab. On Debian or Ubuntu:
+Needs the game's data, 0ad-data 0.0.26 (a download of 1.4 GB, 3.3 GB unpacked), and pymeshlab. On Debian or Ubuntu:
 
-    pip install -e ".[assets]" trimesh
+    pip install -e ".[remesh]"
     apt-get download 0ad-data && dpkg-deb -x 0ad-data_*.deb 0ad
     python tools/make_animals.py --art 0ad --output animals_baked.npz
 
@@ -18,7 +18,10 @@ file holds, in the game's left-handed axes (x to the animal's left, y up, z back
 ``pose_rot`` (400, 31, 3, 3), ``pose_tag`` (400,)
     local rotations of the joints, and the game's clip and frame that each pose comes from.
 
-At the end the arrays are compared with those of the shipped file.
+It takes one to two minutes on one core. At the end the arrays are compared with those of the shipped file: all are
+equal but ``v`` and, through the size of the shapes, ``J``. Closest points jump, so that the registration amplifies
+rounding: a template larger by 1e-12 moves single vertices by up to 3 % of an animal's size, as other versions of the
+libraries do. Most of that is along the surface; vertices lie within 1 mm of the shipped ones on average.
 
 The art is by Wildfire Games, CC BY-SA 3.0; see meshkit/data/assets/LICENSE-animals.txt.
 """
@@ -36,7 +39,7 @@ from make_animal_poses import POSES, all_frames, choose
 from meshkit.io import atomic_write
 
 TEMPLATE = "animal_lioness"
-WITHOUT_BACK_PULL = ("wolfhound",)
+WITHOUT_BACK_PULL = ("wolfhound",)  # its ears would be drawn out to the length of a hare's
 SHAPES = 41
 DIAGONAL = 1.8  # of the bounding box, in metres, before the size is varied
 
