@@ -7,8 +7,8 @@ Needs the game's data, 1.4 GB: on Debian or Ubuntu
 
 Every frame of the four-legged animals' animations is carried over to the common skeleton of 31 joints: a joint takes
 the change of the game's bone that stands for it, from rest to the frame, relative to its parent's. Of the frames in
-which the animal stands or leaps more or less upright, farthest-point sampling takes 400. The registration of the rest
-shapes to one topology, by non-rigid iterated closest points, is not part of this script.
+which the animal stands or leaps more or less upright, farthest-point sampling takes 400. The shapes, and the whole
+shipped file, come from make_animals.
 
 The art is by Wildfire Games, CC BY-SA 3.0; see meshkit/data/assets/LICENSE-animals.txt.
 """
