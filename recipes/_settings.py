@@ -62,6 +62,9 @@ class Settings:
     model: GeneratorConfig = field(default_factory=GeneratorConfig)
     """Sizes of the generator."""
 
+    init: str | None = None
+    """Begin with these weights instead of random ones: a name of meshkit.models.pretrained_names(), or a run's folder."""
+
     lr: float = 1e-3
     """Learning rate. Paper: 1e-4."""
     betas: tuple[float, float] = (0.9, 0.999)

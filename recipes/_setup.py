@@ -8,8 +8,9 @@ from typing import Any
 
 from _machine import world_size
 from _run import UserError
+from torch import nn
 
-from meshkit.models import GeneratorConfig
+from meshkit.models import GeneratorConfig, load_generator, load_pretrained, pretrained_names
 
 
 def check(cfg: Any) -> None:
@@ -68,3 +69,14 @@ def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = Non
             f"the run was begun with {pairs_per_step} pairs per step, which {processes} processes cannot share evenly"
         )
     return replace(begun, batch=batch, accumulate=pairs_per_step // (batch * processes))
+
+
+def initialize(generator: nn.Module, init: str) -> None:
+    """Give ``generator`` the weights called ``init``, with the statistics of the descriptors that they were trained on."""
+    try:
+        known = load_pretrained(init).generator if init in pretrained_names() else load_generator(init)[0]
+        generator.load_state_dict(known.state_dict())
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        advice = f"give one of {', '.join(pretrained_names())}, or the folder of a run with the same --model settings"
+        raise UserError(f"--init {init}: {reason}; {advice}") from None

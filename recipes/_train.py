@@ -21,7 +21,7 @@ from _machine import keep_freed_memory
 from _report import evaluate, report
 from _run import Interruption, Run, UserError
 from _settings import Settings
-from _setup import check, resumed
+from _setup import check, initialize, resumed
 from _step import Diverged, Step, Trainer, count_steps
 from torch import nn
 from tqdm import tqdm
@@ -61,7 +61,9 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
     except (ValueError, RuntimeError) as error:
         raise UserError(str(error)) from None
     pool = getattr(train_pairs, "pool", None)
-    if pool is not None:
+    if cfg.init is not None:
+        initialize(generator, cfg.init)
+    elif pool is not None:
         cast(Any, generator).fit_descriptors(pool.descriptors)
     fused = fabric.device.type in ("cuda", "cpu")
     optimizer = torch.optim.Adam(generator.parameters(), lr=cfg.lr, betas=cfg.betas, eps=cfg.adam_eps, fused=fused)
