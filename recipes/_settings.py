@@ -63,7 +63,8 @@ class Settings:
     """Sizes of the generator."""
 
     init: str | None = None
-    """Begin with these weights instead of random ones: a name of meshkit.models.pretrained_names(), or a run's folder."""
+    """Begin with these weights instead of random ones: a name of meshkit.models.pretrained_names(), or a run's
+    folder."""
 
     lr: float = 1e-3
     """Learning rate. Paper: 1e-4."""

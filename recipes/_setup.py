@@ -72,7 +72,7 @@ def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = Non
 
 
 def initialize(generator: nn.Module, init: str) -> None:
-    """Give ``generator`` the weights called ``init``, with the statistics of the descriptors that they were trained on."""
+    """Give ``generator`` the weights called ``init``, with their statistics of descriptors."""
     try:
         known = load_pretrained(init).generator if init in pretrained_names() else load_generator(init)[0]
         generator.load_state_dict(known.state_dict())

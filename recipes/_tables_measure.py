@@ -1,0 +1,123 @@
+"""Figures of the paper's tables: every system on the same fixed pairs of unseen identities in unseen poses."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from _data import Pairs
+from _report import generate
+from _run import UserError
+from deformation_transfer import DeformationTransfer
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from meshkit.batching import center
+from meshkit.data import MeshPool, PosePairs, load_humans, load_shipped
+from meshkit.deform import deformation_transfer
+from meshkit.io import atomic_write
+from meshkit.metrics import chamfer_distance, correspondence_error, earth_movers_distance, pmd
+from meshkit.models import load_generator, load_pretrained, npt, xdualnet
+
+METRICS = {"pmd": 1e3, "cd": 1e3, "emd": 1e2, "match": 1e2}  # as the paper prints them; correspondence in hundredths
+
+
+def test_pairs(kind: str, vertices: int | None, count: int, out: Path) -> PosePairs:
+    """The first ``count`` fixed test pairs, with their descriptors, which are computed once and kept in ``out``."""
+    body, split = load_shipped(kind, vertices)
+    listed = split.test_pairs[:count]
+    file = out / f"descriptors-{kind}-{len(body.template)}-{count}.safetensors"
+    if not file.exists():
+        identity, pose = listed.view(-1, 2).unbind(1)
+        pool = MeshPool.of(body, identity, pose, progress=True)
+        with atomic_write(file) as path:
+            save_file(pool.state_dict(), path)
+    pool = MeshPool(**load_file(file))
+    return PosePairs(body, split.test_identities, split.test_poses, pool=pool, listed=listed)
+
+
+@torch.no_grad()
+def measure(generator: nn.Module, pairs: Pairs, emd_pairs: int, title: str) -> dict[str, list[float]]:
+    """Each metric of each pair; the earth mover's distance, which is dear, of the first ``emd_pairs``."""
+    columns: dict[str, list[Tensor]] = {name: [] for name in METRICS}
+    generator.eval()
+    for i in tqdm(range(0, len(pairs), 4), desc=title, unit="batch", dynamic_ncols=True):
+        batch = pairs[[(0, j) for j in range(i, min(i + 4, len(pairs)))]]
+        result = generate(generator, batch, i)
+        output, truth = center(result.vertices), batch.ground_truth
+        columns["pmd"].append(pmd(output, truth))
+        columns["cd"].append(chamfer_distance(output, truth))
+        if i < emd_pairs:
+            columns["emd"].append(earth_movers_distance(output, truth))
+        if result.plan is not None:
+            columns["match"].append(correspondence_error(result.plan.argmax(), batch.pose, batch.correspondence))
+    return {name: torch.cat(v).tolist() for name, v in columns.items() if v}
+
+
+def kept(file: Path, make: Callable[[], Any]) -> Any:
+    """What ``make`` gives, made once and kept as JSON."""
+    if not file.exists():
+        value = make()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(file) as path:
+            path.write_text(json.dumps(value) + "\n")
+    return json.loads(file.read_text())
+
+
+def generator_of(name: str, out: Path) -> nn.Module:
+    """The generator of a run, or of shipped weights.
+
+    Raises:
+        UserError: the run's weights cannot be read.
+    """
+    if (out / name).exists():
+        try:
+            return load_generator(out / name)[0]
+        except ValueError as error:
+            raise UserError(str(error)) from None
+    return load_pretrained(name).generator
+
+
+def copies(pairs: PosePairs, emd_pairs: int) -> dict[str, list[float]]:
+    """What the unchanged identity mesh scores."""
+
+    class Copy(nn.Module):
+        takes_batches = True
+
+        def forward(self, batch: Any, place: int) -> Any:
+            return type("Result", (), {"vertices": batch.identity, "warped": None, "plan": None})
+
+    return measure(Copy(), pairs, emd_pairs, "copy")
+
+
+def transferred(pairs: PosePairs, emd_pairs: int) -> dict[str, list[float]]:
+    """Deformation transfer that knows the correspondence, and an average body in the identity's pose."""
+    return measure(DeformationTransfer(pairs, "template"), pairs, emd_pairs, "deformation transfer")
+
+
+@torch.no_grad()
+def seconds_per_transfer(repeats: int = 3) -> dict[str, float]:
+    """Median seconds of one transfer at 6890 vertices, as in the paper's Table 5, on this machine's processor."""
+    body = load_humans(6890)
+    verts = body(torch.tensor([3, 50, 50]), torch.tensor([10, 500, 10]))
+    identity, pose, rest = center(verts)[:, None]
+    baseline, matching = npt().eval(), xdualnet().eval()
+    calls: dict[str, Callable[[], Any]] = {
+        "DT": lambda: deformation_transfer(rest[0], pose[0], identity[0], faces=body.faces),
+        "NPT": lambda: baseline(identity, pose),
+        "X-DualNet and 3D-CoreNet": lambda: matching(identity, pose),
+    }
+    times = {}
+    for name, call in calls.items():
+        measured = []
+        for _ in range(repeats):
+            start = time.perf_counter()
+            call()
+            measured.append(time.perf_counter() - start)
+        times[name] = round(sorted(measured)[repeats // 2], 3)
+    return times

@@ -1,0 +1,190 @@
+"""Figure sheets beside the paper's tables: comparison, ablation, topologies, correspondence, noise, failures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from _report import generate
+from _tables_measure import generator_of, kept, test_pairs
+from _tables_train import SYSTEMS, Job
+from torch import Tensor
+
+from meshkit.batching import center
+from meshkit.data import load_humans, load_shipped
+from meshkit.io import simplify
+from meshkit.metrics import pmd
+from meshkit.models import load_pretrained
+from meshkit.viz import contact_sheet, correspondence_figure, plot_curves, render
+
+NOISE = (0.0, 5.0, 10.0, 20.0)  # millimetres
+SIZES = (1000, 2000, 3445)
+WEIGHTS = ("corenet3d-humans", "xdualnet-humans")
+PICTURE = (220, 220)
+
+
+def score(output: Tensor, truth: Tensor) -> str:
+    return f"PMD {1e3 * float(pmd(output[None], truth[None])):.1f}e-3"
+
+
+def pictures(meshes: Sequence[tuple[Tensor, Tensor]]) -> list[Any]:
+    """Meshes side by side at one scale."""
+    placed = [(center(verts[None])[0], faces) for verts, faces in meshes]
+    everything = torch.cat([verts for verts, _ in placed])
+    bounds = torch.stack([everything.amin(0), everything.amax(0)])
+    return [render(verts, faces, bounds=bounds, size=PICTURE) for verts, faces in placed]
+
+
+def save(sheet: Any, path: Path) -> None:
+    sheet.quantize(128).save(path, optimize=True)
+
+
+@torch.no_grad()
+def transfer_sheet(path: Path, kind: str, columns: dict[str, str], rows: Iterable[int], cfg: Any) -> None:
+    """Rows of test pairs: identity, pose, what each system makes of it, and the truth."""
+    pairs = test_pairs(kind, None, cfg.eval_pairs, cfg.out)
+    nets = {title: generator_of(name, cfg.out).eval() for title, name in columns.items()}
+    grid, captions = [], []
+    for i in rows:
+        batch = pairs[[(0, i)]]
+        faces, truth = batch.identity_faces[0], batch.ground_truth[0]
+        outputs = [center(generate(net, batch, i).vertices)[0] for net in nets.values()]
+        sides = [(batch.identity[0], faces), (batch.pose[0], batch.pose_faces[0])]
+        grid.append(pictures([*sides, *((o, faces) for o in outputs), (truth, faces)]))
+        captions.append(["", "", *(score(o, truth) for o in outputs), ""])
+    titles = ["identity", "pose", *nets, "ground truth"]
+    save(contact_sheet(grid, column_titles=titles, captions=captions), path)
+
+
+@torch.no_grad()
+def noise_curve(count: int = 40) -> dict[str, list[float]]:
+    """Mean PMD (e-3) of the shipped weights over ``count`` test pairs whose pose meshes are noisy."""
+    body, split = load_shipped("humans", 1000)
+    curve: dict[str, list[float]] = {"sigma_mm": list(NOISE)}
+    for name in WEIGHTS:
+        net = load_pretrained(name)
+        curve[name] = []
+        for sigma in NOISE:
+            errors = [noisy(net, body, split.test_pairs[i], sigma)[3] for i in range(count)]
+            curve[name].append(sum(errors) / count)
+    return curve
+
+
+def noisy(net: Any, body: Any, pair: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor, float]:
+    """Identity, noisy pose mesh, result, and its PMD (e-3)."""
+    a, p, b, q = pair[:, None]
+    identity, pose, truth = body(a, p)[0], body(b, q)[0], body(a, q)
+    draw = torch.Generator().manual_seed(int(pair.sum()))
+    pose = pose + 1e-3 * sigma * torch.randn(pose.shape, generator=draw)
+    output = net(identity, pose, identity_faces=body.faces, pose_faces=body.faces)
+    return identity, pose, output, 1e3 * float(pmd(output[None], center(truth))[0])
+
+
+@torch.no_grad()
+def topology_errors(count: int = 20) -> dict[str, Any]:
+    """Mean PMD (e-3) of the shipped weights on bodies of other triangulations, all pairs of their sizes."""
+    _, split = load_shipped("humans", 1000)
+    bodies = {size: load_humans(size) for size in SIZES}
+    nets = [load_pretrained(name) for name in WEIGHTS]
+    table: dict[str, list[float]] = {}
+    for first, one in bodies.items():
+        for second, two in bodies.items():
+            errors = torch.zeros(len(nets))
+            for a, p, b, q in split.test_pairs[:count, :, None]:
+                identity, pose, truth = one(a, p)[0], two(b, q)[0], center(one(a, q))
+                for j, net in enumerate(nets):
+                    output = net(identity, pose, identity_faces=one.faces, pose_faces=two.faces)
+                    errors[j] += 1e3 * float(pmd(output[None], truth)[0]) / count
+            table[f"{first}, {second}"] = errors.tolist()
+    return {"weights": list(WEIGHTS), "pmd": table}
+
+
+@torch.no_grad()
+def topology_sheet(path: Path) -> None:
+    """One pose on bodies of different triangulations, and on a coarse one of none of the shipped topologies."""
+    _, split = load_shipped("humans", 1000)
+    net, grid = load_pretrained(WEIGHTS[0]), []
+    for a, p, b, q in split.test_pairs[2:5, :, None]:
+        two = load_humans(3445)
+        pose = (two(b, q)[0], two.faces)
+        shown = [pose]
+        for size in (1000, 2000):
+            one = load_humans(size)
+            identity = one(a, p)[0]
+            shown += [(identity, one.faces)]
+            shown += [(net(identity, pose[0], identity_faces=one.faces, pose_faces=two.faces), one.faces)]
+        fine = load_humans(6890)
+        coarse = simplify(fine(a, p)[0], fine.faces, 700)
+        shown += [(coarse.verts, coarse.faces)]
+        output = net(coarse.verts, pose[0], identity_faces=coarse.faces, pose_faces=two.faces)
+        grid.append(pictures([*shown, (output, coarse.faces)]))
+    titles = ["pose, 3445", "identity, 1000", "output", "identity, 2000", "output", "identity, 700", "output"]
+    save(contact_sheet(grid, column_titles=titles), path)
+
+
+@torch.no_grad()
+def correspondence_sheet(path: Path, cfg: Any) -> None:
+    """Matches of the shipped weights between two bodies; lines of those more than 10 cm off are red."""
+    batch = test_pairs("humans", None, cfg.eval_pairs, cfg.out)[[(0, 5)]]
+    result = generate(generator_of(WEIGHTS[1], cfg.out).eval(), batch, 5)
+    matches = result.plan.argmax()[0]
+    off = (batch.pose[0, matches] - batch.pose[0, batch.correspondence[0]]).norm(dim=1)
+    figure = correspondence_figure(
+        (batch.identity[0], batch.identity_faces[0]),
+        (batch.pose[0], batch.pose_faces[0]),
+        matches,
+        correct=off < 0.1,
+        titles=["identity", "pose"],
+    )
+    save(figure, path)
+
+
+@torch.no_grad()
+def noise_sheet(path: Path) -> None:
+    """A pose mesh with more and more noise, and what becomes of the result."""
+    body, split = load_shipped("humans", 1000)
+    net, grid, captions = load_pretrained(WEIGHTS[0]), [], []
+    for i in (1, 4):
+        found = [noisy(net, body, split.test_pairs[i], sigma) for sigma in NOISE]
+        meshes = [(found[0][0], body.faces)] + [(m, body.faces) for f in found for m in (f[1], f[2])]
+        grid.append(pictures(meshes))
+        captions.append(["", *(text for f in found for text in ("", f"PMD {f[3]:.1f}e-3"))])
+    titles = ["identity", *(text for sigma in NOISE for text in (f"pose, {sigma:g} mm", "output"))]
+    save(contact_sheet(grid, column_titles=titles, captions=captions), path)
+
+
+def draw_sheets(to: Path, jobs: list[Job], noise: dict[str, list[float]], cfg: Any) -> None:
+    """All sheets; those of systems show the first seed's runs that are there."""
+    there = {(job.data, job.system): job.name for job in jobs if (cfg.out / job.name / "model.safetensors").exists()}
+
+    def columns(kind: str, *systems: str) -> dict[str, str]:
+        return {SYSTEMS[s].title: there[kind, s] for s in systems if (kind, s) in there}
+
+    for kind in cfg.data:
+        compared = columns(kind, "npt", "cycle", "corenet3d", "xdualnet")
+        if compared:
+            transfer_sheet(to / f"comparison-{kind}.png", kind, compared, (0, 3, 7, 11), cfg)
+    if "humans" in cfg.data:
+        parts = ("corenet3d_spadain", "corenet3d", "xdualnet_no_arap", "xdualnet_no_corr", "xdualnet")
+        ablation = columns("humans", *parts)
+        if ablation:
+            transfer_sheet(to / "ablation.png", "humans", ablation, (0, 3, 7), cfg)
+        topology_sheet(to / "topologies.png")
+        correspondence_sheet(to / "correspondence.png", cfg)
+        noise_sheet(to / "noise.png")
+        series = {name: (noise["sigma_mm"], noise[name]) for name in WEIGHTS}
+        plot_curves(to / "noise_curve.png", series, xlabel="noise of the pose mesh (mm)", ylabel="PMD (1e-3 m²)")
+    for kind, system in (("humans", "xdualnet"), ("animals", "xdualnet")):
+        if (kind, system) in there:
+            failure_sheet(to / f"failures-{kind}.png", kind, there[kind, system], cfg)
+
+
+def failure_sheet(path: Path, kind: str, run: str, cfg: Any) -> None:
+    """The test pairs with the largest PMD."""
+    file = cfg.out / "figures" / f"{kind}-{run}-least-{cfg.eval_pairs}.json"
+    errors = torch.tensor(kept(file, dict)["pmd"])
+    worst = errors.topk(min(4, len(errors))).indices.tolist()
+    shipped = {"humans": "xdualnet-humans", "animals": "xdualnet-animals"}[kind]
+    transfer_sheet(path, kind, {"X-DualNet": run, "shipped weights": shipped}, worst, cfg)
