@@ -269,9 +269,7 @@ def main() -> None:
         "train_minutes": summary["train_minutes"],
         "precision": config["precision"],
         "date": time.strftime("%Y-%m-%d", time.gmtime((args.run / "summary.json").stat().st_mtime)),
-        "figures": {
-            LENGTHS[config["data"]][0] if k == "correspondence_m" else k: v for k, v in summary["test"].items()
-        },
+        "figures": {in_lengths if k == "correspondence_m" else k: v for k, v in summary["test"].items()},
         "test_pairs": summary["test_pairs"],
         "units": re.sub(r"\bm\b", UNITS[config["data"]][1], summary["units"]),
         "parameters": summary["parameters"],

@@ -100,10 +100,10 @@ def _glb(meshes: Mapping[str, MeshLike], colors: Mapping[str, Tensor | ArrayLike
     import trimesh
 
     scene, counts = trimesh.Scene(), []
-    for name, mesh in meshes.items():
-        if isinstance(mesh, Tensor) or not isinstance(mesh, Sequence) or len(mesh) != 2:
-            raise ValueError(f"mesh {name!r} must be (verts, faces), got {type(mesh).__name__}")
-        verts, faces = mesh
+    for name, given in meshes.items():
+        if isinstance(given, Tensor) or not isinstance(given, Sequence) or len(given) != 2:
+            raise ValueError(f"mesh {name!r} must be (verts, faces), got {type(given).__name__}")
+        verts, faces = given
         points, triangles = as_array(verts), as_array(faces).astype(np.int64)
         check_mesh(points, triangles)
         rgb = np.broadcast_to(CLAY, points.shape) if name not in colors else as_array(colors[name])
