@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +108,24 @@ def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, Mesh
         # Every process reads the cache; who comes first has made it.
         stores.append(MeshStore.build(chosen, run.path(f"cache_{side}"), progress=run.writes))
     common: dict[str, Any] = {"seed": cfg.seed}
+    if run.writes:
+        tell(stores, cfg.eval_pairs)
     train_pairs = MeshPairs(stores[0], length=cfg.pairs, resample=cfg.resample, ground_truth=cfg.ground_truth, **common)
     return train_pairs, MeshPairs(stores[1], length=cfg.eval_pairs, ground_truth=known(stores[1]), **common)
+
+
+def tell(stores: list[MeshStore], eval_pairs: int) -> None:
+    """Say how much there is on each side; few test meshes make few distinct pairs."""
+    for side, store in zip(("train", "test"), stores, strict=True):
+        people, poses = len(store.identity.unique()), len(store.pose.unique())
+        print(f"{len(store)} meshes to {side} on: {people} identities, {poses} poses", flush=True)
+    possible = len(stores[1]) * (len(stores[1]) - 1)
+    if possible < eval_pairs:
+        print(
+            f"warning: {len(stores[1])} test meshes make {possible} distinct pairs at most; the figures on "
+            f"{eval_pairs} pairs repeat them",
+            file=sys.stderr,
+        )
 
 
 def known(store: MeshStore) -> bool:

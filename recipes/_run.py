@@ -50,6 +50,7 @@ class Run:
 
     def __init__(self, folder: Path, *, resume: bool) -> None:
         self.folder, self.writes = folder, rank() == 0
+        self._made = not folder.exists()
         self.log_file = folder / "log.jsonl"
         self.saved: int | None = None
         self._board: Any = None
@@ -62,6 +63,13 @@ class Run:
                     path.write_text(json.dumps(machine(), indent=2))
         except OSError as error:
             raise UserError(f"cannot write to {folder}: {error.strerror}. Choose another folder with --out") from None
+
+    def remove_if_empty(self) -> None:
+        """Take back a folder made by this run that holds nothing of worth: no checkpoint, log, pool or cache."""
+        worth = ("state.pt", "log.jsonl", "pool_*", "cache_*")
+        kept = (path for name in worth for path in self.folder.glob(name) if path.is_dir() or path.stat().st_size)
+        if self.writes and self._made and not any(kept):
+            shutil.rmtree(self.folder, ignore_errors=True)
 
     def path(self, name: str) -> Path:
         return self.folder / name

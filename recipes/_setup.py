@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import sys
+from dataclasses import fields, replace
+from operator import attrgetter
 from typing import Any
 
-from _machine import world_size
+from _machine import rank, world_size
 from _run import UserError
 from torch import nn
 
@@ -45,6 +47,21 @@ def check(cfg: Any) -> None:
             raise UserError(f"--{name.replace('_', '-')} is a share of the run, got {getattr(cfg, name)}")
 
 
+def given(cfg: Any) -> list[str]:
+    """The flags whose values are not those of the preset, ``model.`` before those of the generator."""
+    presets = getattr(sys.modules[type(cfg).__module__], "PRESETS", {})
+    if cfg.preset not in presets:
+        return []
+    usual = presets[cfg.preset]
+    names = [*(f.name for f in fields(cfg) if f.name != "model"), *(f"model.{f.name}" for f in fields(cfg.model))]
+    # A recipe may set the architecture itself.
+    return [name for name in names if name != "model.architecture" and value_of(cfg, name) != value_of(usual, name)]
+
+
+def value_of(cfg: Any, flag: str) -> Any:
+    return attrgetter(flag)(cfg)
+
+
 def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = None) -> Any:
     """The recorded configuration: a run that goes on must be the run that was begun.
 
@@ -60,6 +77,10 @@ def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = Non
         begun = type(cfg)(**values, model=model)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"config.json of {cfg.out / cfg.name} is no run's ({error}): choose another --name") from None
+    ignored = [flag for flag in given(cfg) if value_of(begun, flag) != value_of(cfg, flag)]
+    if ignored and rank() == 0:
+        words = ", ".join(f"--{flag.replace('_', '-')} (recorded: {value_of(begun, flag)})" for flag in ignored)
+        print(f"warning: --resume goes on with the recorded settings; these do not count: {words}", file=sys.stderr)
     processes = world_size(cfg.devices)
     if pairs_per_step is None or pairs_per_step == begun.batch * begun.accumulate * processes:
         return begun

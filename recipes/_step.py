@@ -74,7 +74,7 @@ class Trainer:
     def gradients(self, batch: PairBatch, s: int) -> tuple[dict[str, Tensor], Tensor]:
         """Losses, and the norm of their sum's gradient, which is left at the parameters."""
         cfg: Any = self.cfg
-        solving = getattr(cfg, "arap", False) and s >= cfg.arap_from * self.steps  # a solver looks at its residuals
+        solving = s >= solver_from(cfg) * self.steps  # a solver looks at its residuals
         if not cfg.graph or solving:
             self.optimizer.zero_grad()
             return self.backward(batch, s)
@@ -100,6 +100,11 @@ def where(batch: PairBatch, s: int) -> str:
     return f"at step {s} (identities {batch.identity_index.tolist()}, poses {batch.pose_index.tolist()})"
 
 
+def solver_from(cfg: Any) -> float:
+    """Share of the run after which a solver is part of a step; 1 for never."""
+    return float(cfg.arap_from) if getattr(cfg, "arap", False) else 1.0
+
+
 def count_steps(trainer: Trainer, loader: Any) -> int:
     """Steps that fit into ``minutes``, from the speed of a few steps on copies that are thrown away.
 
@@ -110,7 +115,7 @@ def count_steps(trainer: Trainer, loader: Any) -> int:
         return cfg.steps
     assert cfg.minutes is not None
     weights, moments = copy.deepcopy(system.state_dict()), copy.deepcopy(optimizer.state_dict())
-    share = 1 - getattr(cfg, "arap_from", 1.0) if getattr(cfg, "arap", False) else 0.0
+    share = 1 - solver_from(cfg)
     trainer.steps, seconds = 1000, []
     for first in (0, 995) if share else (0,):
         times = []

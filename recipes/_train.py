@@ -51,6 +51,14 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
         torch.set_num_threads(cfg.threads)
     check(cfg)
     run = Run(cfg.out / cfg.name, resume=cfg.resume)
+    try:
+        follow(cfg, build, step, run)
+    finally:
+        run.remove_if_empty()
+
+
+def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
+    """What :func:`train` does once the run has its folder."""
     cfg, state = begin(cfg, run)
     try:
         fabric, cfg = connect(cfg)

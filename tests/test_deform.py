@@ -604,3 +604,9 @@ def test_module_level_imports_are_torch_only() -> None:
 
     code = "import sys, meshkit.deform; print([m for m in ('scipy', 'igl', 'trimesh') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_lists_are_refused_with_what_is_wanted():
+    verts, faces = torch.eye(3), torch.tensor([[0, 1, 2]])
+    with pytest.raises(ValueError, match=r"handles must be a tensor, got list: convert it with torch\.as_tensor"):
+        arap_deform(verts, faces, [0, 1, 2], verts)

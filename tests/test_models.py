@@ -797,3 +797,8 @@ def test_match_size_warps_the_scaled_pose_mesh():
         generator(a, b, **features)
     with pytest.raises(ValueError, match="match_size need descriptors"):
         PoseTransferGenerator(**SIZES, match_size=True)
+
+
+def test_a_preset_in_place_of_a_variant_is_named():
+    with pytest.raises(ValueError, match=r'npt\(preset="tiny"\)'):
+        npt("tiny")

@@ -116,6 +116,14 @@ def test_a_vertex_out_of_reach_goes_to_its_target_and_half_precision_stays_finit
     assert rigid_moving_least_squares(v.bfloat16(), t.bfloat16(), radius=0.1).dtype == torch.bfloat16
 
 
+def test_another_unit_than_the_radius_stays_finite() -> None:
+    """In millimetres rounding takes a vertex out of its own reach."""
+    v = 1000 * rand(1, 200, 3, seed=1).float()
+    t = v + 1000 * rand(1, 200, 3, seed=2).float()
+    moved = rigid_moving_least_squares(v, t, radius=0.25)
+    torch.testing.assert_close(moved, t, atol=1.0, rtol=0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -324,3 +324,41 @@ def test_another_number_of_processes_keeps_the_pairs_of_a_step(monkeypatch: pyte
     monkeypatch.setenv("WORLD_SIZE", "3")
     with pytest.raises(recipe_module("_run").UserError, match="8 pairs per step, which 3 processes"):
         setup.resumed(cfg, json.loads(recorded), 8)
+
+
+@pytest.mark.usefixtures("without_report")
+def test_a_failed_start_leaves_no_folder_and_a_begun_run_its_own(run: Any, tmp_path: Path) -> None:
+    error = recipe_module("_run").UserError
+    with pytest.raises(error, match="there is no nowhere"):
+        run("corenet3d", "--data", "faust:nowhere", *FAST)
+    assert not (tmp_path / "run").exists()
+    (tmp_path / "run").mkdir()
+    with pytest.raises(error, match="there is no nowhere"):
+        run("corenet3d", "--data", "faust:nowhere", *FAST)
+    assert (tmp_path / "run").exists()  # another's folder
+
+
+@pytest.mark.usefixtures("without_report")
+def test_flags_that_do_not_count_on_resume_are_named(run: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    run("corenet3d", *FAST)
+    assert "do not count" not in capsys.readouterr().err
+    run("corenet3d", *FAST, "--resume")
+    assert "do not count" not in capsys.readouterr().err
+    run("corenet3d", *FAST, "--resume", "--lr", 0.5, "--model.k", 5)
+    said = capsys.readouterr().err
+    assert "these do not count: " in said and "--lr (recorded: " in said and "--model.k (recorded: 4)" in said
+    assert "--steps" not in said
+
+
+def test_meshes_of_both_sides_are_counted(run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = body_files(tmp_path / "meshes", range(4), range(4))
+    run("corenet3d", "--data", f"folder:{place}", "--eval-pairs", 20, *FAST)
+    said = capsys.readouterr()
+    assert "4 meshes to test on: 2 identities, 2 poses" in said.out
+    assert "4 test meshes make 12 distinct pairs at most" in said.err
+
+
+def test_different_vertex_counts_name_the_option(run: Any, tmp_path: Path) -> None:
+    place = body_files(tmp_path / "meshes", range(4), range(4))
+    with pytest.raises(recipe_module("_run").UserError, match="--points None"):
+        run("xdualnet", "--data", f"folder:{place}", "--no-arap", *FAST)

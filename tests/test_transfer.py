@@ -10,6 +10,7 @@ import math
 import re
 import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -526,6 +527,24 @@ def test_any_kind_of_value_error_gets_the_meshs_name():
 
 def _raise(error: Exception) -> None:
     raise error
+
+
+def test_a_misspelt_option_is_told_last_with_the_nearest(capsys):
+    with pytest.raises(SystemExit):
+        command("id.obj", "id.obj", "--idenity-up", "+z")
+    assert "did you mean --identity-up?" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_the_report_names_the_results_frame(person, mover):
+    pose = (100 * mover[0], mover[1])
+    for frame, said in (("pose", "unit (cm) of the pose mesh"), ("identity", "unit (m) of the identity mesh")):
+        result = transfer_pose(person, pose, weights=copier(data="humans"), frame=frame, **UPRIGHT)
+        assert f"in the axes and {said}, up +z" in str(result.report)
+
+
+def test_animals_are_not_said_to_be_in_metres():
+    scale = find_scale(1.0, 1.0, None, among=("m",))
+    assert str(scale).startswith("m (guessed") and "m (" not in str(replace(scale, metric=False))
 
 
 def test_the_command_writes_mesh_picture_and_page(person, mover, tmp_path, monkeypatch, capsys):

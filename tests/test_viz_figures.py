@@ -101,6 +101,14 @@ def test_correspondence_figure_puts_bodies_and_lines_in_place() -> None:
     assert not ((np.asarray(right).astype(int) @ [1, -1, 0]) > 60).any()
 
 
+def test_bodies_of_different_units_are_both_seen() -> None:
+    mesh, large = (SPHERE.vertices, SPHERE.faces), (100 * SPHERE.vertices, SPHERE.faces)
+    options = {"size": (100, 120), "lines": 0, "colors": np.full((len(SPHERE.vertices), 3), 0.5)}
+    figure = np.asarray(correspondence_figure(mesh, large, np.arange(len(SPHERE.vertices)), **options))
+    ink = [float((side.min(-1) < 200).mean()) for side in (figure[:, :100], figure[:, 100:])]
+    assert min(ink) > 0.3 and abs(ink[0] - ink[1]) < 0.01
+
+
 def test_lines_join_visible_points_only() -> None:
     mesh = (SPHERE.vertices, SPHERE.faces)
     mirrored = np.array([np.linalg.norm(SPHERE.vertices - p * [1, -1, 1], axis=1).argmin() for p in SPHERE.vertices])
@@ -259,6 +267,8 @@ def test_bad_pages_are_named(tmp_path: Path) -> None:
         (good, {"notes": []}, "0 notes for 1 meshes"),
         (good, {"up": "x"}, "up must be 'y' or 'z'"),
         ({"a": (VERTS[0], BODY.faces + 1)}, {}, "but there are 1000 vertices"),
+        ((VERTS[0], BODY.faces), {}, "meshes must be a dict by name.* got tuple"),
+        ({"a": VERTS[0]}, {}, r"mesh 'a' must be \(verts, faces\), got Tensor"),
     ]
     for meshes, options, message in cases:
         with pytest.raises(ValueError, match=message):

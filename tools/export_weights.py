@@ -46,6 +46,10 @@ UNITS = {
         "units",
     ),
 }
+LENGTHS = {  # keys of the card that are lengths: only humans are in metres
+    "humans": ("correspondence_m", "largest_distance_m"),
+    "animals": ("correspondence_units", "largest_distance_units"),
+}
 IGNORED = {"preset", "out", "name", "resume", "apply", "result", "threads", "accelerator", "data", "seed", "workers"}
 LICENCES = {
     "humans": {
@@ -173,7 +177,7 @@ def markdown(name: str, card: dict[str, Any]) -> str:
     processor = machine["gpu"] or machine["processor"]
     minutes = card["train_minutes"]
     unit, short = UNITS[card["data"]]
-    moved = card["rounding"]["largest_distance_m"]
+    moved = card["rounding"][LENGTHS[card["data"]][1]]
     distance = f"{1e3 * moved:.3f} mm" if short == "m" else f"{moved:.1e} {short}"
     return f"""# {name}
 
@@ -249,6 +253,7 @@ def main() -> None:
     distance = check(run, net, body, pairs)
     if not distance < TOLERANCE:
         raise SystemExit(f"error: 16-bit parameters move vertices by {distance:.2e}, more than {TOLERANCE:g} metres")
+    in_lengths, moved = LENGTHS[config["data"]]
     card = {
         "name": args.name,
         "system": system,
@@ -264,14 +269,14 @@ def main() -> None:
         "train_minutes": summary["train_minutes"],
         "precision": config["precision"],
         "date": time.strftime("%Y-%m-%d", time.gmtime((args.run / "summary.json").stat().st_mtime)),
-        "figures": summary["test"],
+        "figures": {in_lengths if k == "correspondence_m" else k: v for k, v in summary["test"].items()},
         "test_pairs": summary["test_pairs"],
         "units": re.sub(r"\bm\b", UNITS[config["data"]][1], summary["units"]),
         "parameters": summary["parameters"],
         "machine": machine,
         "licence": LICENCES[config["data"]],
         "first_pairs_pmd": errors(run, body, split.test_pairs[:8]),
-        "rounding": {"largest_distance_m": round(distance, 6), "pairs": len(pairs)},
+        "rounding": {moved: round(distance, 6), "pairs": len(pairs)},
         "usual": measure_usual(net, body, split.test_pairs[: args.usual_pairs]),
         "usual_pairs": min(args.usual_pairs, len(split.test_pairs)),
         "model": asdict(model),

@@ -132,7 +132,9 @@ class DualReconstruction(nn.Module):
         check_verts(identity, name="identity")
         check_verts(pose, name="pose")
         if self.points is not None and (identity_mask is not None or pose_mask is not None):
-            raise ValueError("points works on unpadded batches; leave it None for ragged ones")
+            raise ValueError(
+                "points works on unpadded batches; meshes of different vertex counts need points=None (--points None)"
+            )
         a = Mesh(identity, identity_mask, identity_descriptors).encoded(self.generator)
         b = Mesh(pose, pose_mask, pose_descriptors).encoded(self.generator)
         b = b.subset(self._choose(pose))

@@ -110,6 +110,10 @@ def arap_deform(
         >>> torch.allclose(moved, verts + 1.0, atol=1e-6), bool(info.converged)
         (True, True)
     """
+    inputs = {"verts": verts, "faces": faces, "handles": handles, "handle_pos": handle_pos}
+    for name, value in (inputs | {"soft_targets": soft_targets, "soft_weights": soft_weights, "mask": mask}).items():
+        if not isinstance(value, Tensor) and (value is not None or name in inputs):
+            raise ValueError(f"{name} must be a tensor, got {type(value).__name__}: convert it with torch.as_tensor")
     check_options(method, max_iter, tol, grad, grad_tol, solver, degenerate)
     if isinstance(init, str) and init != "rest":
         raise ValueError(f'init must be "rest" or a tensor of positions, got {init!r}')

@@ -96,6 +96,8 @@ def _weights(v: Tensor, radius: float, mask: Tensor | None, features: Tensor | N
         if mask is not None:
             f = f.masked_fill(~mask[..., None], 0.0)
         q.mul_(torch.cdist(f, f).square_().mul_(-1 / f.shape[2]).exp_())
+    # Far from the origin, or in another unit than the radius, rounding takes a vertex out of its own reach: 0 / 0 then.
+    q.diagonal(dim1=1, dim2=2).clamp_min_(0.5)
     if mask is not None:
         # A padded vertex is its own neighbourhood, so that no sum of weights is zero.
         own = torch.eye(v.shape[1], dtype=torch.bool, device=v.device)

@@ -171,6 +171,8 @@ def npt(variant: str = "maxpool", *, preset: str = "paper") -> NPT:
         >>> sum(p.numel() for p in npt(preset="tiny").parameters()) < 500_000
         True
     """
+    if variant in _NPT:
+        raise ValueError(f'{variant!r} is a preset, not a variant: npt(preset="{variant}")')
     return NPT(variant, encoder_widths=_pick(_NPT, preset))
 
 

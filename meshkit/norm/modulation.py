@@ -21,8 +21,9 @@ class Modulation(NamedTuple):
 
     Args:
         mean: :math:`\mu` ``(B, 1, C)``, in the precision the statistics were taken in.
-        scale_bias: :math:`m_s` ``(B, 1, C)``.
-        shift_bias: :math:`m_t` ``(B, 1, C)``.
+        scale_bias: :math:`m_s` ``(B, 1, C)``: one per sample and channel, the same at all vertices. What differs from
+            vertex to vertex goes through ``features``.
+        shift_bias: :math:`m_t` ``(B, 1, C)``, likewise.
         features: f ``(B, N, D)``, or None where scale and shift are the same at all vertices.
         scale_weight: :math:`M_s` ``(B, D, C)``, or None beside ``features=None``.
         shift_weight: :math:`M_t` ``(B, D, C)``, or None beside ``features=None``.

@@ -102,12 +102,14 @@ class Scale:
         metres: per unit.
         fit: further factor that brings a body of unheard-of size to that of the training bodies; else 1.
         given: whether the unit was given, or guessed from the surface.
+        metric: whether the bodies that the weights know are in metres; the shipped animals are in a unit of their own.
     """
 
     unit: str
     metres: float
     fit: float
     given: bool
+    metric: bool = True
 
     @property
     def factor(self) -> float:
@@ -116,6 +118,10 @@ class Scale:
 
     def __str__(self) -> str:
         text = f"{self.unit} ({'given' if self.given else 'guessed from the surface area'})"
+        if not self.metric and not self.given:
+            text = (
+                "unknown, near that of the weights" if self.metres == 1 else f"unknown, {self.metres:g} of the weights'"
+            )
         return text if self.fit == 1 else f"{text}, scaled by {self.fit:.3g} to the size that the weights know"
 
 

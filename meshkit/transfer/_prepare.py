@@ -126,6 +126,7 @@ def prepare(
     among = ("m", "cm", "mm") if kind == "animals" else tuple(UNITS)
     area = _area(clean.verts, clean.faces)
     scale = named(name, lambda: find_scale(area, _reference_area(kind), unit, among=among))
+    scale = dataclasses.replace(scale, metric=kind != "animals")
     metric = dataclasses.replace(
         clean,
         verts=(clean.verts * scale.factor).float().to(net_device),

@@ -1,11 +1,12 @@
 """The console script ``meshkit-transfer``: the pose of one mesh file for the body of another."""
 
 import argparse
+import difflib
 import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -23,10 +24,21 @@ _FORMATS = (".obj", ".ply", ".off", ".stl", ".glb")
 _ROWS = 6  # of the picture of a sequence
 
 
+class _Parser(argparse.ArgumentParser):
+    """Names the option that was probably meant."""
+
+    def error(self, message: str) -> NoReturn:
+        known = [option for action in self._actions for option in action.option_strings if option.startswith("--")]
+        for word in re.findall(r"--[\w-]+", message) if "unrecognized" in message else ():
+            near = difflib.get_close_matches(word, known, n=1)
+            message += f"; did you mean {near[0]}?" if near else ""
+        super().error(message)
+
+
 def parser() -> argparse.ArgumentParser:
     """What the command takes."""
     axes = ("+x", "-x", "+y", "-y", "+z", "-z")
-    made = argparse.ArgumentParser(
+    made = _Parser(
         prog="meshkit-transfer",
         description="Give the body of IDENTITY the pose of POSE: any two meshes (obj, ply, off, stl, glb). POSE may "
         "also be a folder of meshes, an .npz file with verts (T, V, 3) and faces (F, 3), or a .glb file of several "

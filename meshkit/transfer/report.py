@@ -23,6 +23,7 @@ class TransferReport:
         calibrated: whether the weights' card says what is usual; otherwise there are no warnings from the numbers.
         refined: weight of the network's result in the refinement; ``None`` if there was none.
         seconds: time taken.
+        frame: axes and unit of the result, in words.
     """
 
     identity: Prepared
@@ -33,6 +34,7 @@ class TransferReport:
     calibrated: bool
     refined: float | None
     seconds: float
+    frame: str = ""
 
     def __str__(self) -> str:
         numbers = self.confidence
@@ -43,6 +45,8 @@ class TransferReport:
         lines = [f"identity {self.identity.name}", _indented(str(self.identity))]
         lines += [f"pose     {self.pose.name}", _indented(str(self.pose)), f"weights  {self.weights}"]
         lines.append(f"result   {', '.join(facts)}; {self.seconds:.1f} s")
+        if self.frame:
+            lines.append(f"         {self.frame}")
         if self.warnings:
             lines += [f"UNUSUAL  {warning}" for warning in self.warnings]
         elif self.calibrated:

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from meshkit.deform import arap_deform
 from meshkit.transfer._choose import Weights, choose_weights
-from meshkit.transfer._frames import turn_up
+from meshkit.transfer._frames import axis_name, turn_up
+from meshkit.transfer._kinds import guess_kind
 from meshkit.transfer._prepare import Mesh, Prepared, named, prepare
 from meshkit.transfer.confidence import measure_confidence
 from meshkit.transfer.report import TransferReport, TransferResult
@@ -120,15 +121,19 @@ class PoseTransfer:
             small = _refined(own.verts, own.simple.faces, small, self.refine)
         posed = own.carry(small)
         usual = net.card.get("usual", {})
+        warnings = numbers.warnings(usual)
+        if warnings:  # only then, as it costs a spectrum of each mesh
+            warnings = (*self._strangers(other), *warnings)
         report = TransferReport(
             own,
             other,
             self.weights,
             numbers,
-            numbers.warnings(usual),
+            warnings,
             bool(usual),
             self.refine,
             time.perf_counter() - start,
+            self._frame_in_words(other, other.up if up is None else up),
         )
         faces = own.faces
         views = (
@@ -137,6 +142,21 @@ class PoseTransfer:
             (posed, faces.to(posed.device)),
         )
         return TransferResult(self._placed(posed, other, other.up if up is None else up).cpu(), faces, report, views)
+
+    def _strangers(self, other: Prepared) -> tuple[str, ...]:
+        """Which of the two meshes are clearly of another kind than the weights."""
+        found = []
+        for role, mesh in (("identity", self.identity), ("pose", other)) if self.kind else ():
+            kind, clear = guess_kind(mesh.simple.verts, mesh.simple.faces)
+            if clear and kind != self.kind:
+                found.append(f"these weights are for {self.kind}, but the {role} mesh has the shape of {kind}")
+        return tuple(found)
+
+    def _frame_in_words(self, other: Prepared, up: Tensor) -> str:
+        own = other if self.frame == "pose" else self.identity
+        axis = axis_name(up if self.frame == "pose" else own.up)
+        unit = f" ({own.scale.unit})" if own.scale.metric or own.scale.given else ""
+        return f"in the axes and unit{unit} of the {self.frame} mesh, up {axis}"
 
     def _placed(self, posed: Tensor, other: Prepared, up: Tensor) -> Tensor:
         """From the frame of the weights to that of a file: on the ground, and over the place, of the pose mesh."""

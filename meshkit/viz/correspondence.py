@@ -17,6 +17,7 @@ __all__ = ["correspondence_figure", "position_colors", "transfer_colors"]
 
 _WRONG = (200, 40, 40)
 _SHARP = 3  # lines are drawn at this multiple of the picture and reduced
+_ALIKE = 3.0  # bodies whose sizes differ by more are not drawn at one scale
 MeshLike = tuple[Tensor | ArrayLike, Tensor | ArrayLike]
 
 
@@ -94,7 +95,10 @@ def correspondence_figure(
     up: Literal["y", "z"] = "z",
     titles: Sequence[str] | None = None,
 ) -> "Image":
-    """Two bodies at one scale, the left one in the colours of its matches on the right one, and lines between them.
+    """Two bodies side by side, the left one in the colours of its matches on the right one, and lines between them.
+
+    They are drawn at one scale; where one is more than three times the other's size, as bodies of different units are,
+    each is drawn at its own.
 
     A good correspondence paints both bodies alike and its lines do not cross without reason. The lines start at points
     spread evenly over the part of the source that is seen, whose matches are seen as well.
@@ -142,11 +146,16 @@ def correspondence_figure(
 
     camera = {"azimuth": azimuth, "elevation": elevation, "up": up}
     views = [fit_view(p, size, azimuth=azimuth, elevation=elevation, up=up) for p in (points, other)]
-    scale = max(min(size) / view.pixels_per_unit for view in views)
-    views = [fit_view(p, size, azimuth=azimuth, elevation=elevation, up=up, scale=scale) for p in (points, other)]
+    scales = [min(size) / view.pixels_per_unit for view in views]
+    if max(scales) <= _ALIKE * min(scales):
+        scales = [max(scales)] * 2
+    views = [
+        fit_view(p, size, azimuth=azimuth, elevation=elevation, up=up, scale=scale)
+        for p, scale in zip((points, other), scales, strict=True)
+    ]
     pictures = [
         render(p, f, colors=c, size=size, scale=scale, supersample=3, **camera)  # type: ignore[arg-type]
-        for p, f, c in ((points, faces, palette[index]), (other, other_faces, palette))
+        for p, f, c, scale in ((points, faces, palette[index], scales[0]), (other, other_faces, palette, scales[1]))
     ]
     room = round(0.07 * size[1]) if titles else 0
     sheet = Image.new("RGB", (2 * size[0], size[1] + room), "white")

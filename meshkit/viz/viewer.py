@@ -61,6 +61,9 @@ def save_html(
         >>> "a triangle" in file.read_text()
         True
     """
+    for name, given in (("meshes", meshes), ("colors", colors if colors is not None else {})):
+        if not isinstance(given, Mapping):
+            raise ValueError(f'{name} must be a dict by name, such as {{"body": ...}}, got {type(given).__name__}')
     if not meshes:
         raise ValueError("nothing to show: meshes is empty")
     if up not in {"y", "z"}:
@@ -97,7 +100,10 @@ def _glb(meshes: Mapping[str, MeshLike], colors: Mapping[str, Tensor | ArrayLike
     import trimesh
 
     scene, counts = trimesh.Scene(), []
-    for name, (verts, faces) in meshes.items():
+    for name, given in meshes.items():
+        if isinstance(given, Tensor) or not isinstance(given, Sequence) or len(given) != 2:
+            raise ValueError(f"mesh {name!r} must be (verts, faces), got {type(given).__name__}")
+        verts, faces = given
         points, triangles = as_array(verts), as_array(faces).astype(np.int64)
         check_mesh(points, triangles)
         rgb = np.broadcast_to(CLAY, points.shape) if name not in colors else as_array(colors[name])
