@@ -80,7 +80,9 @@ layers = {"soft attention": attention, "Sinkhorn": transport}
 curves, networks = {}, {}
 for name, layer in layers.items():
     torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(19, 64), nn.LeakyReLU(0.1), nn.Linear(64, 64), nn.LeakyReLU(0.1), nn.Linear(64, 32))
+    network = nn.Sequential(
+        nn.Linear(19, 64), nn.LeakyReLU(0.1), nn.Linear(64, 64), nn.LeakyReLU(0.1), nn.Linear(64, 32)
+    )
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
     curves[name], networks[name] = [], network
     for _ in range(steps):

@@ -68,9 +68,9 @@ matches = plan.argmax()[0]
 error = score("signatures", matches)
 
 # %%
-# Nearly every match is right up to the side, and most are on the wrong one. Signatures come from lengths on the surface,
-# and the mirror image of a body has the same lengths: no intrinsic descriptor can tell the sides apart. Red lines are off
-# by more than 10 cm.
+# Nearly every match is right up to the side, and most are on the wrong one. Signatures come from lengths on the
+# surface, and the mirror image of a body has the same lengths: no intrinsic descriptor can tell the sides apart. Red
+# lines are off by more than 10 cm.
 
 
 def draw(matches, error, name):
@@ -106,10 +106,10 @@ show(
 # %%
 # Second remedy: the surface is one piece
 # ---------------------------------------
-# Place is not needed. A match that jumps from the left thigh to the right calf tears the leg at the knee, so each vertex
-# chooses between its match and its partner's such that edges stretch least: a minimum cut. That leaves two wholes, the
-# body and its mirror image, and the one with its outside out is taken. The choice needs smooth positions, which are the
-# soft match's, ``plan.barycentric``: hard matches are torn everywhere.
+# Place is not needed. A match that jumps from the left thigh to the right calf tears the leg at the knee, so each
+# vertex chooses between its match and its partner's such that edges stretch least: a minimum cut. That leaves two
+# wholes, the body and its mirror image, and the one with its outside out is taken. The choice needs smooth positions,
+# which are the soft match's, ``plan.barycentric``: hard matches are torn everywhere.
 
 warp = plan.barycentric(pose[None])[0]
 swap = mirror_labels(identity, body.faces, warp, warp[partner], partner)
