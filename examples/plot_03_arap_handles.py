@@ -162,8 +162,8 @@ axis.semilogy(range(1, steps + 1), curve)
 axis.set(xlabel="step", ylabel="distance to the targets (cm)")
 
 # %%
-# Green is around the knee and the elbow. All six handles took part, also those that were to stay: give them a loss of their
-# own if they must.
+# Green is around the knee and the elbow. All six handles took part, also those that were to stay: give them a loss of
+# their own if they must.
 
 colors[torch.cdist(rest[seen], rest).topk(50, largest=False).indices.flatten()] = 0.1, 0.5, 0.25
 draw({"before": start, "led to where they were seen": x.detach()}, "handles_found")
