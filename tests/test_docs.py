@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 TOP_LEVEL = {"py:class", "py:function", "py:data", "py:exception"}
 # Pages whose code tests of their own run.
-ELSEWHERE = {"arap.md", "consistency.md", "data.md", "io_viz.md", "losses.md", "metrics.md"}
+ELSEWHERE = {"arap.md", "consistency.md", "data.md", "io_viz.md", "losses.md", "metrics.md", "transfer.md"}
 
 
 def blocks(page: Path) -> list[str]:
