@@ -6,7 +6,6 @@ it as well. What only a submodule lists follows at the end of the page.
 
 import importlib
 import inspect
-import operator
 import pkgutil
 from pathlib import Path
 from typing import NamedTuple
@@ -80,8 +79,7 @@ def write_pages(app) -> None:
 
 def skip_fields(app, what, name, obj, skip, options):
     """Fields of named tuples are described by the class; their own docstring says only "Alias for field number"."""
-    tuple_field = isinstance(obj, type(inspect.getattr_static(Entry, "path"))) and not isinstance(obj, operator.itemgetter)
-    return True if tuple_field else None
+    return True if isinstance(obj, type(inspect.getattr_static(Entry, "path"))) else None
 
 
 def setup(app):
