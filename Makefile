@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format scatter clean
+.PHONY: help demo test docs lint format scatter clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -18,6 +18,10 @@ demo: $(READY) ## train X-DualNet for about eight minutes on the shipped bodies 
 
 test: lint ## lint, then run every test and docstring example
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+docs: $(READY) ## build the documentation site, tutorials included, in docs/_build/html
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -d docs/_build/doctrees docs docs/_build/html
+	@echo "Site: $(CURDIR)/docs/_build/html/index.html"
 
 lint: $(READY) ## ruff and mypy
 	$(BIN)/ruff check --quiet
@@ -33,7 +37,7 @@ scatter: $(READY) ## build the optional torch-scatter backend in .venv, seven mi
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/test_scatter.py
 
 clean: ## remove the virtual environment, caches and builds (runs/ is kept)
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) build dist docs/_build docs/auto_examples docs/api .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Re-made only when the pins or the package's metadata change; an interrupted set-up leaves no stamp and starts again.

@@ -1,0 +1,126 @@
+"""The documentation site builds without a warning, lists every public name and no other, and its code runs."""
+
+import importlib
+import inspect
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from update_public_api import public_names
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+TOP_LEVEL = {"py:class", "py:function", "py:data", "py:exception"}
+# Pages whose code tests of their own run.
+ELSEWHERE = {"arap.md", "consistency.md", "data.md", "io_viz.md", "losses.md", "metrics.md", "transfer.md"}
+
+
+def blocks(page: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
+PAGES = [page.name for page in sorted(DOCS.glob("*.md")) if blocks(page) and page.name not in ELSEWHERE]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built site, from a copy of the sources, so that nothing is written beside them."""
+    for needed in ("sphinx", "furo", "myst_parser", "sphinx_gallery"):
+        pytest.importorskip(needed)
+    folder = tmp_path_factory.mktemp("site")
+    source = folder / "source"
+    shutil.copytree(DOCS, source / "docs", ignore=shutil.ignore_patterns("_build", "auto_examples", "api"))
+    shutil.copytree(ROOT / "examples", source / "examples")
+    for name in ("meshkit", "recipes", "tests", "benchmarks", "README.md", "CITATION.cff"):
+        (source / name).symlink_to(ROOT / name)
+    html = folder / "html"
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-D", "plot_gallery=0"]
+    command += ["-d", str(folder / "doctrees"), str(source / "docs"), str(html)]
+    run = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert run.returncode == 0, run.stderr
+    return html
+
+
+@pytest.fixture(scope="module")
+def inventory(site: Path) -> dict[str, dict[str, tuple[str, str]]]:
+    """Documented objects: kind -> name -> page and anchor."""
+    from sphinx.util.inventory import InventoryFile
+
+    with (site / "objects.inv").open("rb") as stream:
+        loaded = InventoryFile.load(stream, "", lambda base, uri: uri)
+    return {kind: {name: (item[2], item[3]) for name, item in of.items()} for kind, of in loaded.items()}
+
+
+def test_every_public_name_is_documented_and_no_other(inventory) -> None:
+    documented = {name for kind in TOP_LEVEL for name in inventory.get(kind, {})}
+    public = set(public_names()) - {"meshkit.__version__"}
+    # Constants have no home of their own: the same object, listed by two modules, is documented once.
+    values = {name: resolve(name) for name in public}
+    shown = [id(values[name]) for name in documented & public]
+    missing = {name for name in public - documented if id(values[name]) not in shown}
+    assert not missing
+    assert not documented - public
+
+
+def test_every_public_name_has_a_docstring_of_its_own() -> None:
+    values = {name: resolve(name) for name in public_names()}
+    own = {n: vars(v).get("__doc__") if inspect.isclass(v) else v.__doc__ for n, v in values.items() if callable(v)}
+    bare = [name for name, text in own.items() if not text]
+    assert not bare
+
+
+def test_every_component_has_a_page_and_a_reference(site: Path) -> None:
+    import meshkit
+
+    files = Path(meshkit.__file__).parent.iterdir()
+    components = {p.stem for p in files if p.suffix == ".py" or (p / "__init__.py").exists()}
+    components = {c for c in components if not c.startswith("_")}
+    assert {p.stem for p in (site / "api").glob("meshkit.*.html")} == {f"meshkit.{c}" for c in components}
+    pages = "".join(p.read_text() for p in DOCS.glob("*.md"))
+    assert not [c for c in components if f"`meshkit.{c}`" not in pages]
+
+
+def test_equations_are_drawn_and_nothing_is_fetched(site: Path) -> None:
+    page = (site / "optimal_transport.html").read_text()
+    assert page.count('<svg class="equation"') > 20
+    for file in site.rglob("*.html"):
+        fetched = re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="(https?:)?//', file.read_text())
+        assert not fetched, file.name
+
+
+def test_links_between_pages_hold(site: Path) -> None:
+    """Links of the Markdown are checked as GitHub follows them; Sphinx has checked its own."""
+    for page in DOCS.glob("*.md"):
+        for link in re.findall(r"\]\((?!https?://|#)([^)#\s]+)", page.read_text()):
+            assert (DOCS / link).exists(), f"{page.name}: {link}"
+
+
+def test_tests_that_pages_name_exist() -> None:
+    """A claim names the test that holds it as `tests/test_norm.py::test_gradcheck`."""
+    pattern = re.compile(r"tests/(test_\w+\.py)::(\w+)")
+    named = [(page.name, *ref) for page in DOCS.glob("*.md") for ref in pattern.findall(page.read_text())]
+    assert len(named) > 20
+    for page, file, name in named:
+        assert f"def {name}(" in (ROOT / "tests" / file).read_text(), f"{page}: {file}::{name}"
+
+
+def test_every_benchmark_and_question_is_on_its_page() -> None:
+    text = (DOCS / "benchmarks.md").read_text()
+    assert not [p.name for p in (ROOT / "benchmarks").glob("*.py") if f"benchmarks/{p.name}" not in text]
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_page_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "page"}
+    for number, block in enumerate(blocks(DOCS / name)):
+        exec(compile(block, f"block {number} of {name}", "exec"), names)
+
+
+def resolve(path: str) -> object:
+    module, _, name = path.rpartition(".")
+    return getattr(importlib.import_module(module), name)
