@@ -13,6 +13,7 @@ from meshkit.batching import center
 from meshkit.data import PairBatch, PosePairs
 from meshkit.io import save_mesh
 from meshkit.metrics import chamfer_distance, correspondence_error, pmd
+from meshkit.models import NPT
 from meshkit.viz import contact_sheet, error_colors, plot_curves, render
 
 
@@ -48,7 +49,10 @@ def generate(generator: nn.Module, batch: PairBatch, place: int) -> Any:
         return generator(batch, place)
     # With both hands of the identity to match, a generator wants to know what hangs together.
     faces = {"identity_faces": batch.identity_faces} if getattr(generator, "symmetry", False) else {}
-    return generator(batch.identity, batch.pose, **inputs(batch), **faces)
+    told = inputs(batch)
+    if isinstance(generator, NPT):  # it takes no descriptors, which a pool may have computed for others
+        told = {"identity_mask": told["identity_mask"], "pose_mask": told["pose_mask"]}
+    return generator(batch.identity, batch.pose, **told, **faces)
 
 
 def report(run: Run, generator: nn.Module, pairs: Pairs, device: torch.device, facts: dict[str, Any]) -> None:
