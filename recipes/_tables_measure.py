@@ -53,7 +53,7 @@ def measure(generator: nn.Module, pairs: Pairs, emd_pairs: int, title: str) -> d
         columns["pmd"].append(pmd(output, truth))
         columns["cd"].append(chamfer_distance(output, truth))
         if i < emd_pairs:
-            columns["emd"].append(earth_movers_distance(output, truth))
+            columns["emd"].append(earth_movers_distance(output[: emd_pairs - i], truth[: emd_pairs - i]))
         if result.plan is not None:
             columns["match"].append(correspondence_error(result.plan.argmax(), batch.pose, batch.correspondence))
     return {name: torch.cat(v).tolist() for name, v in columns.items() if v}

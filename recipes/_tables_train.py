@@ -58,7 +58,7 @@ def jobs(data: tuple[str, ...], seeds: int) -> list[Job]:
 
 
 def command(job: Job, cfg: Any) -> list[str]:
-    """The recipe's command line for a run: anybody can repeat a row of a table with it."""
+    """The recipe's command line for a run, but for where it is kept: anybody can repeat a row of a table with it."""
     system = SYSTEMS[job.system]
     words = [f"recipes/{system.recipe}.py", "--preset", cfg.preset, "--data", job.data, "--seed", str(job.seed)]
     if cfg.minutes is None:
@@ -66,7 +66,7 @@ def command(job: Job, cfg: Any) -> list[str]:
     else:
         words += ["--minutes", str(cfg.minutes)]
     words += ["--batch", str(cfg.batch), "--eval-pairs", "24", "--eval-every", "100000", *system.flags]
-    return [*words, "--out", str(cfg.out), "--name", job.name, "--threads", str(cfg.threads), "--resume"]
+    return [*words, "--threads", str(cfg.threads)]
 
 
 def budget(job: Job, cfg: Any) -> dict[str, Any]:
@@ -99,8 +99,8 @@ def train_missing(wanted: list[Job], cfg: Any) -> Iterator[Job]:
         folder = cfg.out / job.name
         folder.mkdir(parents=True, exist_ok=True)
         share_pools(folder, cfg.out, job)
-        environment = os.environ | {"OMP_NUM_THREADS": str(cfg.threads)} if cfg.threads else os.environ
-        words = [sys.executable, *command(job, cfg)]
+        environment = dict(os.environ) | ({"OMP_NUM_THREADS": str(cfg.threads)} if cfg.threads else {})
+        words = [sys.executable, *command(job, cfg), "--out", str(cfg.out.resolve()), "--name", job.name, "--resume"]
         status = subprocess.run(words, cwd=Path(__file__).parents[1], env=environment, check=False).returncode
         if status == 130:
             raise KeyboardInterrupt

@@ -113,6 +113,22 @@ def write_csv(path: Path, rows: list[Row]) -> None:
             writer.writerow([row.title, row.runs, *cells])
 
 
+def measured_once(extra: dict[str, Any], paper_seconds: dict[str, float], cfg: Any) -> list[str]:
+    """Tables of what does not depend on the runs: times, and the shipped weights under noise and triangulations."""
+    seconds, noise, sizes = extra["seconds"], extra["noise"], extra["topologies"]
+    title = f"Table 5, time of a transfer at 6890 vertices with the papers' sizes, {cfg.threads} thread(s)"
+    timed = [[name, f"{s:.3f}", f"{s / seconds['NPT']:.1f}", paper_seconds[name]] for name, s in seconds.items()]
+    curves = [[name, *(f"{v:.2f}" for v in noise[name])] for name in noise if name != "sigma_mm"]
+    cells = [[place, *(f"{v:.2f}" for v in values)] for place, values in sizes["pmd"].items()]
+    heads = ["noise of the pose mesh (mm)", *(f"{sigma:g}" for sigma in noise["sigma_mm"])]
+    others = ["identity, pose vertices", *sizes["weights"]]
+    return [
+        plain(title, ["method", f"s ({machine()['processor']})", "times NPT's", "paper, s (GPU)"], timed),
+        plain("Noise: PMD (e-3) of shipped weights, humans", heads, curves),
+        plain("Triangulations: PMD (e-3) of shipped weights, humans", others, cells),
+    ]
+
+
 def write_tables(
     to: Path, tables: dict[str, list[Row]], extra: dict[str, Any], paper_seconds: dict[str, float], cfg: Any, jobs: Any
 ) -> None:
@@ -122,21 +138,7 @@ def write_tables(
     for name, rows in tables.items():
         parts += [f"## {TITLES[name]}\n", table(rows), order(rows)]
         write_csv(to / f"{name}.csv", rows)
-    seconds, noise, sizes = extra["seconds"], extra["noise"], extra["topologies"]
-    title = f"Table 5, time of a transfer at 6890 vertices with the papers' sizes, {cfg.threads} thread(s)"
-    timed = [[name, f"{s:.3f}", f"{s / seconds['NPT']:.1f}", paper_seconds[name]] for name, s in seconds.items()]
-    parts.append(plain(title, ["method", f"s ({machine()['processor']})", "times NPT's", "paper, s (GPU)"], timed))
-    heads = ["noise of the pose mesh (mm)", *(f"{sigma:g}" for sigma in noise["sigma_mm"])]
-    curves = [[name, *(f"{v:.2f}" for v in noise[name])] for name in noise if name != "sigma_mm"]
-    parts.append(plain("Noise: PMD (e-3) of shipped weights, humans", heads, curves))
-    cells = [[place, *(f"{v:.2f}" for v in values)] for place, values in sizes["pmd"].items()]
-    parts.append(
-        plain(
-            "Triangulations: PMD (e-3) of shipped weights, humans",
-            ["identity, pose vertices", *sizes["weights"]],
-            cells,
-        )
-    )
+    parts += measured_once(extra, paper_seconds, cfg) if extra else []
     commands = "\n".join(f"python {' '.join(command(job, cfg))}" for job in done)
     parts.append(f"## Commands\n\n```sh\n{commands}\n```\n")
     with atomic_write(to / "tables.md") as path:

@@ -54,7 +54,7 @@ class Config:
     train: bool = True
     """Train what is missing; --no-train makes tables of what there is."""
     sheets: bool = True
-    """Draw the figure sheets."""
+    """Draw the figure sheets, and measure noise, other triangulations and the time of a transfer."""
     out: Path = Path("runs/tables")
     """Folder of the runs and measurements."""
     to: Path | None = None
@@ -68,10 +68,11 @@ def figures(job_name: str, kind: str, vertices: int | None, count: int, cfg: Con
 
     def make() -> dict[str, list[float]]:
         pairs = test_pairs(kind, vertices, count, cfg.out)
+        moved = cfg.emd_pairs if vertices is None else 0  # a minute for each pair of 6890 vertices
         special: dict[str, Callable[..., dict[str, list[float]]]] = {"copy": copies, "dt": transferred}
         if job_name in special:
-            return special[job_name](pairs, cfg.emd_pairs)
-        return measure(generator_of(job_name, cfg.out), pairs, cfg.emd_pairs, job_name)
+            return special[job_name](pairs, moved)
+        return measure(generator_of(job_name, cfg.out), pairs, moved, job_name)
 
     where = cfg.out / "figures" / f"{kind}-{job_name}-{vertices or 'least'}-{count}.json"
     found: dict[str, list[float]] = kept(where, make)
@@ -165,11 +166,10 @@ def main() -> None:
             print(f"{job.name}: done, {len(missing) - number} to go", flush=True)
     to = cfg.to or cfg.out
     to.mkdir(parents=True, exist_ok=True)
-    extra = {
-        "seconds": kept(cfg.out / "figures" / "seconds.json", seconds_per_transfer),
-        "noise": kept(cfg.out / "figures" / "noise.json", noise_curve),
-        "topologies": kept(cfg.out / "figures" / "topologies.json", topology_errors),
-    }
+    extra: dict[str, Any] = {}
+    if cfg.sheets:
+        for name, make in (("seconds", seconds_per_transfer), ("noise", noise_curve), ("topologies", topology_errors)):
+            extra[name] = kept(cfg.out / "figures" / f"{name}.json", make)
     done = [job for job in wanted if finished(job, cfg)]
     write_tables(to, tables(cfg, done), extra, PAPER_SECONDS, cfg, (wanted, done))
     if cfg.sheets:

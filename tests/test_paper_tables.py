@@ -1,0 +1,188 @@
+"""The recipe of the paper's tables: which runs it asks for, what it makes of them, that it goes on where it stopped."""
+
+import csv
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from recipe_runs import recipe_module
+from safetensors.torch import save_file
+
+from meshkit.batching import center
+from meshkit.data import human_split, load_humans
+from meshkit.metrics import chamfer_distance, earth_movers_distance, pmd
+from meshkit.models import GeneratorConfig
+
+pytest.importorskip("tyro")
+pytest.importorskip("lightning_fabric")
+
+MODEL = GeneratorConfig(architecture="npt_maxpool", extractor_widths=(4, 4, 5))
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Any:
+    return recipe_module("paper_tables").Config(
+        data=("humans",), pairs=8, seeds=2, eval_pairs=3, emd_pairs=2, large_pairs=0, sheets=False, out=tmp_path
+    )
+
+
+@pytest.fixture
+def tables(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Path]:
+    """Runs the recipe's ``main`` without training, on three test pairs, and gives the tables' folder."""
+
+    def tables(*arguments: Any) -> Path:
+        words = [
+            "--data",
+            "humans",
+            "--pairs",
+            8,
+            "--seeds",
+            2,
+            "--eval-pairs",
+            3,
+            "--emd-pairs",
+            2,
+            "--large-pairs",
+            0,
+        ]
+        words = ["paper_tables.py", *words, "--no-train", "--no-sheets", "--out", tmp_path, *arguments]
+        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+        recipe_module("paper_tables").main()
+        return tmp_path
+
+    return tables
+
+
+def finished_run(folder: Path, seed: int, **changes: Any) -> torch.nn.Module:
+    """A run's folder as the NPT recipe leaves it, and its generator."""
+    folder.mkdir()
+    torch.manual_seed(seed)
+    net = MODEL.build()
+    save_file({k: v.contiguous() for k, v in net.state_dict().items()}, folder / "model.safetensors")
+    (folder / "model.json").write_text(json.dumps(asdict(MODEL)))
+    config = {"preset": "tiny", "batch": 4, "seed": seed, "data": "humans", "steps": 2} | changes
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "summary.json").write_text("{}")
+    return net.eval()
+
+
+def figures_of(net: torch.nn.Module) -> dict[str, float]:
+    """PMD, Chamfer and earth mover's distance on the first test pairs, in the tables' units."""
+    body, found = load_humans(1000), {"pmd": [], "cd": [], "emd": []}
+    for i, (a, p, b, q) in enumerate(human_split().test_pairs[:3].tolist()):
+        who, how = torch.tensor([a, b, a]), torch.tensor([p, q, q])
+        identity, pose, truth = center(body(who, how))[:, None]
+        with torch.no_grad():
+            output = center(net(identity, pose).vertices)
+        found["pmd"].append(1e3 * float(pmd(output, truth)))
+        found["cd"].append(1e3 * float(chamfer_distance(output, truth)))
+        if i < 2:
+            found["emd"].append(1e2 * float(earth_movers_distance(output, truth)))
+    return {name: sum(values) / len(values) for name, values in found.items()}
+
+
+def test_every_system_comes_before_the_second_seed_of_any() -> None:
+    train = recipe_module("_tables_train")
+    listed = train.jobs(("humans", "animals"), 2)
+    assert len(listed) == 2 * (len(train.SYSTEMS) + len(train.COMPARED))
+    assert [job.seed for job in listed] == sorted(job.seed for job in listed)
+    assert {job.system for job in listed if job.data == "animals"} == set(train.COMPARED)
+    assert len({job.name for job in listed}) == len(listed)
+
+
+def test_every_command_is_one_that_its_recipe_takes(config: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    train, settings = recipe_module("_tables_train"), recipe_module("_settings")
+    for system in train.SYSTEMS:
+        file, *flags = train.command(train.Job("humans", system, 1), config)
+        monkeypatch.setattr(sys, "argv", [file, *flags])
+        parsed = settings.parse(recipe_module(Path(file).stem).PRESETS, None)
+        assert (parsed.seed, parsed.steps, parsed.batch, parsed.data) == (1, 2, 4, "humans")
+
+
+def test_tables_hold_means_and_spreads_over_runs(tables: Callable[..., Path], tmp_path: Path) -> None:
+    direct = [figures_of(finished_run(tmp_path / f"humans-npt-{seed}", seed)) for seed in (0, 1)]
+    folder = tables()
+    with (folder / "comparison-humans.csv").open() as stream:
+        rows = {row["method"]: row for row in csv.DictReader(stream)}
+    npt = rows["NPT"]
+    assert npt["runs"] == "2"
+    for metric in ("pmd", "cd", "emd"):
+        first, second = (figures[metric] for figures in direct)
+        assert float(npt[f"{metric} mean"]) == pytest.approx((first + second) / 2, rel=1e-3)
+        assert float(npt[f"{metric} spread"]) == pytest.approx(abs(first - second) / math.sqrt(2), rel=2e-2, abs=1e-3)
+    assert npt["match mean"] == ""  # it matches nothing
+    assert float(npt["pmd paper"]) == 2.77
+    assert float(rows["deformation transfer"]["pmd mean"]) < float(rows["copy the identity"]["pmd mean"])
+    text = (folder / "tables.md").read_text()
+    assert "humans corenet3d (2)" in text, "runs that are missing are named"
+    assert "recipes/npt.py" in text and "--seed 1" in text
+
+
+def test_measurements_are_made_once(
+    tables: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finished_run(tmp_path / "humans-npt-0", 0)
+    before = (tables() / "tables.md").read_text()
+    monkeypatch.setattr(recipe_module("paper_tables"), "measure", None)
+    assert (tables() / "tables.md").read_text() == before
+
+
+def test_a_run_with_another_budget_is_refused(tables: Callable[..., Path], tmp_path: Path) -> None:
+    finished_run(tmp_path / "humans-npt-0", 0, steps=3)
+    with pytest.raises(recipe_module("_run").UserError, match=r"humans-npt-0 was trained with \{'steps': 3\}"):
+        tables()
+
+
+def test_training_shares_descriptors_and_stops_at_a_failure(config: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    train, ran = recipe_module("_tables_train"), []
+    status = {"xdualnet": 3}
+
+    def run(words: list[str], **_: Any) -> Any:
+        folder = config.out / words[words.index("--name") + 1]
+        ran.append(folder.name)
+        if (folder / "pool_train.safetensors").exists():
+            assert (folder / "pool_train.safetensors").read_text() == "pool"
+        else:
+            (folder / "pool_train.safetensors").write_text("pool")
+        (folder / "summary.json").write_text("{}")
+        return SimpleNamespace(returncode=status.get(folder.name.split("-")[1], 0))
+
+    monkeypatch.setattr(subprocess, "run", run)
+    wanted = [train.Job("humans", system, 0) for system in ("corenet3d", "cycle", "xdualnet", "npt")]
+    with pytest.raises(recipe_module("_run").UserError, match="ended with status 3"):
+        list(train.train_missing(wanted, config))
+    assert ran == ["humans-corenet3d-0", "humans-cycle-0", "humans-xdualnet-0"]
+    first, second = (config.out / name / "pool_train.safetensors" for name in ran[:2])
+    assert first.samefile(second)
+    status["xdualnet"] = 0
+    (config.out / "humans-xdualnet-0" / "summary.json").unlink()
+    assert [job.system for job in train.train_missing(wanted, config)] == ["xdualnet", "npt"], "what is done stays done"
+
+
+def test_the_order_of_methods_says_where_spreads_overlap() -> None:
+    write = recipe_module("_tables_write")
+
+    def row(title: str, mean: float, spread: float, paper: float) -> Any:
+        return write.Row(title, {"pmd": (mean, spread)}, 3, {"pmd": paper})
+
+    rows = [row("a", 3.0, 0.1, 1.0), row("b", 2.0, 0.1, 2.0), row("c", 2.05, 0.1, 3.0)]
+    assert write.order(rows).startswith("PMD here: b ~ c < a. Paper: a < b < c.")
+    assert "Single runs" not in write.order(rows)
+    assert "Single runs" in write.order(
+        [replace(r, runs=1, figures={"pmd": (r.figures["pmd"][0], math.nan)}) for r in rows]
+    )
+
+
+def test_bad_counts_are_named(tables: Callable[..., Path]) -> None:
+    with pytest.raises(recipe_module("_run").UserError, match="multiple of --batch 3"):
+        tables("--batch", 3)
+    with pytest.raises(recipe_module("_run").UserError, match="there are 400 test pairs"):
+        tables("--eval-pairs", 500)
