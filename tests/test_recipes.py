@@ -362,3 +362,17 @@ def test_different_vertex_counts_name_the_option(run: Any, tmp_path: Path) -> No
     place = body_files(tmp_path / "meshes", range(4), range(4))
     with pytest.raises(recipe_module("_run").UserError, match="--points None"):
         run("xdualnet", "--data", f"folder:{place}", "--no-arap", *FAST)
+
+
+def test_init_begins_with_the_weights_of_a_run(run: Callable[..., Path], without_report: None, tmp_path: Path) -> None:
+    size = ("--model.extractor-widths", 4, 4, 5)
+    known = run("npt", "--steps", 2, *size)
+    begun = (
+        run("npt", "--name", "second", "--steps", 1, "--seed", 1, "--lr", 0, "--init", known, *size).parent / "second"
+    )
+    before, after = (load_generator(folder)[0].state_dict() for folder in (known, begun))
+    parameters = [name for name, _ in load_generator(known)[0].named_parameters()]
+    assert parameters and all(torch.equal(before[name], after[name]) for name in parameters)
+    other = ("npt", "--name", "third", "--steps", 1, "--init", known, "--model.extractor-widths", 4, 4, 6)
+    with pytest.raises(recipe_module("_run").UserError, match=r"--init .*run: .*corenet3d-humans"):
+        run(*other)

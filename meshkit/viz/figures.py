@@ -115,6 +115,7 @@ def plot_curves(
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import StrMethodFormatter
 
     curves = {name: (np.asarray(x, float), np.asarray(y, float)) for name, (x, y) in series.items()}
     if not curves:
@@ -131,6 +132,10 @@ def plot_curves(
         axes.plot(x, y, label=name, color=color, linewidth=1.6, marker=marker, markersize=3.5)
     if logy:
         axes.set_yscale("log", nonpositive="mask")
+        low, high = axes.get_ylim()
+        if high < 100 * low:  # few decades: plain numbers, in between as well
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
     axes.grid(True, which="major", color="#dfe3e8", linewidth=0.8)
