@@ -156,8 +156,8 @@ def noise_sheet(path: Path) -> None:
 
 
 def draw_sheets(to: Path, jobs: list[Job], noise: dict[str, list[float]], cfg: Any) -> None:
-    """All sheets; those of systems show the first seed's runs that are there."""
-    there = {(job.data, job.system): job.name for job in jobs if (cfg.out / job.name / "model.safetensors").exists()}
+    """All sheets; those of systems show the first of a system's runs among ``jobs``."""
+    there = {(job.data, job.system): job.name for job in reversed(jobs)}
 
     def columns(kind: str, *systems: str) -> dict[str, str]:
         return {SYSTEMS[s].title: there[kind, s] for s in systems if (kind, s) in there}

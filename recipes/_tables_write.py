@@ -24,6 +24,18 @@ TITLES = {
     "humans-6890": "Humans at 6890 vertices, trained at 1000, one seed",
 }
 
+SHEETS = {
+    "comparison-humans": "Comparison, humans, first seed",
+    "comparison-animals": "Comparison, animals, first seed",
+    "ablation": "Ablations, first seed",
+    "topologies": "Other triangulations, shipped weights",
+    "correspondence": "Correspondence, shipped weights: lines of matches more than 10 cm off are red",
+    "noise": "Noise on the pose mesh, shipped weights",
+    "noise_curve": "PMD against noise, shipped weights, 40 pairs",
+    "failures-humans": "The worst test pairs, humans",
+    "failures-animals": "The worst test pairs, animals",
+}
+
 
 @dataclass(frozen=True)
 class Row:
@@ -139,6 +151,9 @@ def write_tables(
         parts += [f"## {TITLES[name]}\n", table(rows), order(rows)]
         write_csv(to / f"{name}.csv", rows)
     parts += measured_once(extra, paper_seconds, cfg) if extra else []
+    parts += [
+        f"## {title}\n\n![{title}]({name}.png)\n" for name, title in SHEETS.items() if (to / f"{name}.png").exists()
+    ]
     commands = "\n".join(f"python {' '.join(command(job, cfg))}" for job in done)
     parts.append(f"## Commands\n\n```sh\n{commands}\n```\n")
     with atomic_write(to / "tables.md") as path:

@@ -171,9 +171,10 @@ def main() -> None:
         for name, make in (("seconds", seconds_per_transfer), ("noise", noise_curve), ("topologies", topology_errors)):
             extra[name] = kept(cfg.out / "figures" / f"{name}.json", make)
     done = [job for job in wanted if finished(job, cfg)]
-    write_tables(to, tables(cfg, done), extra, PAPER_SECONDS, cfg, (wanted, done))
+    found = tables(cfg, done)
     if cfg.sheets:
-        draw_sheets(to, [Job(kind, system, 0) for kind in cfg.data for system in SYSTEMS], extra["noise"], cfg)
+        draw_sheets(to, done, extra["noise"], cfg)
+    write_tables(to, found, extra, PAPER_SECONDS, cfg, (wanted, done))
     print(f"tables and sheets: {to}")
 
 
