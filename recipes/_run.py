@@ -25,8 +25,11 @@ class UserError(Exception):
     """Something the user can put right; shown without a traceback."""
 
 
-def guard(main: Any, *arguments: Any) -> None:
-    """Run ``main``; show a user's error as one line and exit with status 2."""
+RESUME = "--resume goes on from the last checkpoint, or begins again if there is none"
+
+
+def guard(main: Any, *arguments: Any, advice: str = RESUME) -> None:
+    """Run ``main``; show a user's error as one line and exit with status 2, an interruption with ``advice`` and 130."""
     try:
         main(*arguments)
     except UserError as error:
@@ -36,7 +39,6 @@ def guard(main: Any, *arguments: Any) -> None:
         print(f"error: {error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
-        advice = "--resume goes on from the last checkpoint, or begins again if there is none"
         print(f"\ninterrupted; {advice}", file=sys.stderr)
         raise SystemExit(130) from None
 

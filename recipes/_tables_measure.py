@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import torch
 from _data import Pairs
+from _machine import machine
 from _report import generate
 from _run import UserError
 from deformation_transfer import DeformationTransfer
@@ -22,7 +25,7 @@ from meshkit.data import MeshPool, PosePairs, load_humans, load_shipped
 from meshkit.deform import deformation_transfer
 from meshkit.io import atomic_write
 from meshkit.metrics import chamfer_distance, correspondence_error, earth_movers_distance, pmd
-from meshkit.models import load_generator, load_pretrained, npt, xdualnet
+from meshkit.models import corenet3d, load_generator, load_pretrained, npt, xdualnet
 
 METRICS = {"pmd": 1e3, "cd": 1e3, "emd": 1e2, "match": 1e2}  # as the paper prints them; correspondence in hundredths
 
@@ -65,8 +68,16 @@ def kept(file: Path, make: Callable[[], Any]) -> Any:
         value = make()
         file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(file) as path:
-            path.write_text(json.dumps(value) + "\n")
+            path.write_text(json.dumps(value) + "\n", encoding="utf-8")
     return json.loads(file.read_text())
+
+
+def fingerprint(name: str, out: Path) -> str:
+    """A few digits that change with the weights of a run, or with shipped ones."""
+    file = out / name / "model.safetensors"
+    if not file.exists():
+        file = Path(str(files("meshkit.weights") / f"{name}.safetensors"))
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:8] if file.exists() else "none"
 
 
 def generator_of(name: str, out: Path) -> nn.Module:
@@ -101,16 +112,17 @@ def transferred(pairs: PosePairs, emd_pairs: int) -> dict[str, list[float]]:
 
 
 @torch.no_grad()
-def seconds_per_transfer(repeats: int = 3) -> dict[str, float]:
-    """Median seconds of one transfer at 6890 vertices, as in the paper's Table 5, on this machine's processor."""
+def seconds_per_transfer(repeats: int = 3) -> dict[str, Any]:
+    """Median seconds of one transfer at 6890 vertices, as in the paper's Table 5, and the processor they are of."""
     body = load_humans(6890)
     verts = body(torch.tensor([3, 50, 50]), torch.tensor([10, 500, 10]))
     identity, pose, rest = center(verts)[:, None]
-    baseline, matching = npt().eval(), xdualnet().eval()
+    baseline, supervised, matching = npt().eval(), corenet3d().eval(), xdualnet().eval()
     calls: dict[str, Callable[[], Any]] = {
         "DT": lambda: deformation_transfer(rest[0], pose[0], identity[0], faces=body.faces),
         "NPT": lambda: baseline(identity, pose),
-        "X-DualNet and 3D-CoreNet": lambda: matching(identity, pose),
+        "3D-CoreNet": lambda: supervised(identity, pose),
+        "X-DualNet": lambda: matching(identity, pose),
     }
     times = {}
     for name, call in calls.items():
@@ -120,4 +132,4 @@ def seconds_per_transfer(repeats: int = 3) -> dict[str, float]:
             call()
             measured.append(time.perf_counter() - start)
         times[name] = round(sorted(measured)[repeats // 2], 3)
-    return times
+    return {"seconds": times, "threads": torch.get_num_threads(), "processor": machine()["processor"]}

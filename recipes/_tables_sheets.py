@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from _report import generate
-from _tables_measure import generator_of, kept, test_pairs
+from _tables_measure import generator_of, test_pairs
 from _tables_train import SYSTEMS, Job
 from torch import Tensor
 
 from meshkit.batching import center
 from meshkit.data import load_humans, load_shipped
-from meshkit.io import simplify
+from meshkit.io import atomic_write, simplify
 from meshkit.metrics import pmd
 from meshkit.models import load_pretrained
 from meshkit.viz import contact_sheet, correspondence_figure, plot_curves, render
@@ -23,6 +23,7 @@ NOISE = (0.0, 5.0, 10.0, 20.0)  # millimetres
 SIZES = (1000, 2000, 3445)
 WEIGHTS = ("corenet3d-humans", "xdualnet-humans")
 PICTURE = (220, 220)
+ABLATED = ("corenet3d_spadain", "corenet3d", "xdualnet_no_arap", "xdualnet_no_corr", "xdualnet")
 
 
 def score(output: Tensor, truth: Tensor) -> str:
@@ -38,7 +39,8 @@ def pictures(meshes: Sequence[tuple[Tensor, Tensor]]) -> list[Any]:
 
 
 def save(sheet: Any, path: Path) -> None:
-    sheet.quantize(128).save(path, optimize=True)
+    with atomic_write(path) as temporary:
+        sheet.quantize(128).save(temporary, format="PNG", optimize=True)
 
 
 @torch.no_grad()
@@ -47,7 +49,7 @@ def transfer_sheet(path: Path, kind: str, columns: dict[str, str], rows: Iterabl
     pairs = test_pairs(kind, None, cfg.eval_pairs, cfg.out)
     nets = {title: generator_of(name, cfg.out).eval() for title, name in columns.items()}
     grid, captions = [], []
-    for i in rows:
+    for i in (row for row in rows if row < len(pairs)):
         batch = pairs[[(0, i)]]
         faces, truth = batch.identity_faces[0], batch.ground_truth[0]
         outputs = [center(generate(net, batch, i).vertices)[0] for net in nets.values()]
@@ -127,8 +129,9 @@ def topology_sheet(path: Path) -> None:
 @torch.no_grad()
 def correspondence_sheet(path: Path, cfg: Any) -> None:
     """Matches of the shipped weights between two bodies; lines of those more than 10 cm off are red."""
-    batch = test_pairs("humans", None, cfg.eval_pairs, cfg.out)[[(0, 5)]]
-    result = generate(generator_of(WEIGHTS[1], cfg.out).eval(), batch, 5)
+    row = min(5, cfg.eval_pairs - 1)
+    batch = test_pairs("humans", None, cfg.eval_pairs, cfg.out)[[(0, row)]]
+    result = generate(generator_of(WEIGHTS[1], cfg.out).eval(), batch, row)
     matches = result.plan.argmax()[0]
     off = (batch.pose[0, matches] - batch.pose[0, batch.correspondence[0]]).norm(dim=1)
     figure = correspondence_figure(
@@ -155,36 +158,38 @@ def noise_sheet(path: Path) -> None:
     save(contact_sheet(grid, column_titles=titles, captions=captions), path)
 
 
-def draw_sheets(to: Path, jobs: list[Job], noise: dict[str, list[float]], cfg: Any) -> None:
-    """All sheets; those of systems show the first of a system's runs among ``jobs``."""
-    there = {(job.data, job.system): job.name for job in reversed(jobs)}
+def draw_sheets(
+    to: Path, jobs: list[Job], noise: dict[str, list[float]], errors: Callable[[Job], list[float]], cfg: Any
+) -> list[str]:
+    """All sheets; those of systems show the first of a system's runs among ``jobs``.
 
-    def columns(kind: str, *systems: str) -> dict[str, str]:
-        return {SYSTEMS[s].title: there[kind, s] for s in systems if (kind, s) in there}
+    ``errors`` gives the PMD of every test pair of a run. Returns the names of what was drawn.
+    """
+    there = {(job.data, job.system): job for job in reversed(jobs)}
+    drawn = []
+
+    def sheet(name: str, draw: Callable[..., None], *arguments: Any) -> None:
+        draw(to / f"{name}.png", *arguments)
+        drawn.append(name)
 
     for kind in cfg.data:
-        compared = columns(kind, "npt", "cycle", "corenet3d", "xdualnet")
-        if compared:
-            transfer_sheet(to / f"comparison-{kind}.png", kind, compared, (0, 3, 7, 11), cfg)
+        for name, systems, rows in (
+            (f"comparison-{kind}", ("npt", "cycle", "corenet3d", "xdualnet"), (0, 3, 7, 11)),
+            ("ablation", ABLATED if kind == "humans" else (), (0, 3, 7)),
+        ):
+            columns = {SYSTEMS[s].title: there[kind, s].name for s in systems if (kind, s) in there}
+            if columns:
+                sheet(name, transfer_sheet, kind, columns, rows, cfg)
+        if (kind, "xdualnet") in there:
+            job = there[kind, "xdualnet"]
+            worst = torch.tensor(errors(job)).topk(min(4, cfg.eval_pairs)).indices.tolist()
+            columns = {"X-DualNet": job.name, "shipped weights": f"xdualnet-{kind}"}
+            sheet(f"failures-{kind}", transfer_sheet, kind, columns, worst, cfg)
     if "humans" in cfg.data:
-        parts = ("corenet3d_spadain", "corenet3d", "xdualnet_no_arap", "xdualnet_no_corr", "xdualnet")
-        ablation = columns("humans", *parts)
-        if ablation:
-            transfer_sheet(to / "ablation.png", "humans", ablation, (0, 3, 7), cfg)
-        topology_sheet(to / "topologies.png")
-        correspondence_sheet(to / "correspondence.png", cfg)
-        noise_sheet(to / "noise.png")
+        sheet("topologies", topology_sheet)
+        sheet("correspondence", correspondence_sheet, cfg)
+        sheet("noise", noise_sheet)
         series = {name: (noise["sigma_mm"], noise[name]) for name in WEIGHTS}
         plot_curves(to / "noise_curve.png", series, xlabel="noise of the pose mesh (mm)", ylabel="PMD (1e-3 m²)")
-    for kind, system in (("humans", "xdualnet"), ("animals", "xdualnet")):
-        if (kind, system) in there:
-            failure_sheet(to / f"failures-{kind}.png", kind, there[kind, system], cfg)
-
-
-def failure_sheet(path: Path, kind: str, run: str, cfg: Any) -> None:
-    """The test pairs with the largest PMD."""
-    file = cfg.out / "figures" / f"{kind}-{run}-least-{cfg.eval_pairs}.json"
-    errors = torch.tensor(kept(file, dict)["pmd"])
-    worst = errors.topk(min(4, len(errors))).indices.tolist()
-    shipped = {"humans": "xdualnet-humans", "animals": "xdualnet-animals"}[kind]
-    transfer_sheet(path, kind, {"X-DualNet": run, "shipped weights": shipped}, worst, cfg)
+        drawn.append("noise_curve")
+    return drawn

@@ -10,7 +10,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from _machine import machine
 from _tables_train import Job, command
 
 from meshkit.io import atomic_write
@@ -67,23 +66,21 @@ def table(rows: list[Row]) -> str:
 
 
 def order(rows: list[Row]) -> str:
-    """Methods by their PMD, here and in the paper; ties where the spreads overlap are said."""
+    """Methods by their PMD, here and in the paper; what the number of runs leaves open is said."""
     compared = [row for row in rows if row.paper]
     if len(compared) < 2:
         return ""
     here = sorted(compared, key=lambda row: row.figures["pmd"][0])
     printed = sorted(compared, key=lambda row: row.paper["pmd"])
-    signs = []
+    text = here[0].title
     for first, second in pairwise(here):
         (a, spread_a), (b, spread_b) = first.figures["pmd"], second.figures["pmd"]
-        spread = math.hypot(spread_a, spread_b)
-        signs.append(" < " if math.isnan(spread) else (" < " if b - a > spread else " ~ "))
-    text = here[0].title + "".join(sign + row.title for sign, row in zip(signs, here[1:], strict=True))
+        error = math.hypot(spread_a / math.sqrt(first.runs), spread_b / math.sqrt(second.runs))
+        text += (" ? " if math.isnan(error) else " < " if b - a > 2 * error else " ~ ") + second.title
     paper = " < ".join(row.title for row in printed)
-    unsure = " Single runs: no spread is known." if any(row.runs == 1 for row in compared) else ""
     return (
-        f"PMD here: {text}. Paper: {paper}. `~` marks a difference below one standard deviation of the "
-        f"difference of two runs.{unsure}\n"
+        f"PMD here: {text}. Paper: {paper}. `<`: by more than two standard errors of the difference of means; `~`: by "
+        "less; `?`: a single run, whose spread is not known.\n"
     )
 
 
@@ -98,10 +95,13 @@ def budget_text(cfg: Any, missing: list[Job]) -> str:
     given = f"{cfg.pairs} training pairs" if cfg.minutes is None else f"{cfg.minutes} minutes"
     text = (
         f"Every system is trained with {given} (batch {cfg.batch}, preset `{cfg.preset}`) and measured on the same "
-        f"{cfg.eval_pairs} pairs of unseen identities in unseen poses (EMD: the first {cfg.emd_pairs}), humans with "
+        f"{cfg.eval_pairs} pairs of unseen identities in unseen poses (EMD: the first "
+        f"{min(cfg.emd_pairs, cfg.eval_pairs)}), humans with "
         "1000 vertices, animals with 1962. `±` is the standard deviation over runs that differ in their seed. In "
         "brackets: the paper's figures, on SMPL and SMAL, after 24 to 90 GPU hours; the data differ, so only the order "
-        "compares. Match error: distance between the matched and the true vertex, in the unit of the bodies.\n"
+        "compares. Match error: distance between the matched and the true vertex, in the unit of the bodies.\n\n"
+        "What the presets make unequal: X-DualNet and the baseline resolve exchanged limbs in evaluation (`symmetry`), "
+        "3D-CoreNet does not need to; NPT takes no descriptors, as published.\n"
     )
     if missing:
         counts = Counter(f"{job.data} {job.system}" for job in missing)
@@ -112,7 +112,7 @@ def budget_text(cfg: Any, missing: list[Job]) -> str:
 
 def write_csv(path: Path, rows: list[Row]) -> None:
     """A table with its means, spreads and the paper's figures in columns of their own."""
-    with atomic_write(path) as temporary, temporary.open("w", newline="") as stream:
+    with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(
             ["method", "runs", *(f"{name} {kind}" for name in HEADS for kind in ("mean", "spread", "paper"))]
@@ -125,36 +125,41 @@ def write_csv(path: Path, rows: list[Row]) -> None:
             writer.writerow([row.title, row.runs, *cells])
 
 
-def measured_once(extra: dict[str, Any], paper_seconds: dict[str, float], cfg: Any) -> list[str]:
+def measured_once(extra: dict[str, Any], paper_seconds: dict[str, float]) -> list[str]:
     """Tables of what does not depend on the runs: times, and the shipped weights under noise and triangulations."""
     seconds, noise, sizes = extra["seconds"], extra["noise"], extra["topologies"]
-    title = f"Table 5, time of a transfer at 6890 vertices with the papers' sizes, {cfg.threads} thread(s)"
-    timed = [[name, f"{s:.3f}", f"{s / seconds['NPT']:.1f}", paper_seconds[name]] for name, s in seconds.items()]
+    times, where = seconds["seconds"], f"{seconds['processor']}, {seconds['threads']} thread(s)"
+    timed = [[name, f"{s:.3f}", f"{s / times['NPT']:.1f}", paper_seconds[name]] for name, s in times.items()]
     curves = [[name, *(f"{v:.2f}" for v in noise[name])] for name in noise if name != "sigma_mm"]
     cells = [[place, *(f"{v:.2f}" for v in values)] for place, values in sizes["pmd"].items()]
+    heads_of_times = ["method", f"s ({where})", "times NPT's", "paper, s (GPU)"]
     heads = ["noise of the pose mesh (mm)", *(f"{sigma:g}" for sigma in noise["sigma_mm"])]
     others = ["identity, pose vertices", *sizes["weights"]]
     return [
-        plain(title, ["method", f"s ({machine()['processor']})", "times NPT's", "paper, s (GPU)"], timed),
+        plain("Table 5, time of a transfer at 6890 vertices, the papers' sizes", heads_of_times, timed),
         plain("Noise: PMD (e-3) of shipped weights, humans", heads, curves),
         plain("Triangulations: PMD (e-3) of shipped weights, humans", others, cells),
     ]
 
 
 def write_tables(
-    to: Path, tables: dict[str, list[Row]], extra: dict[str, Any], paper_seconds: dict[str, float], cfg: Any, jobs: Any
+    to: Path,
+    tables: dict[str, list[Row]],
+    extra: dict[str, Any],
+    paper_seconds: dict[str, float],
+    cfg: Any,
+    jobs: tuple[list[Job], list[Job]],
+    drawn: list[str],
 ) -> None:
-    """tables.md, and a CSV file for each table; ``jobs`` are those wanted and those done."""
+    """tables.md, and a CSV file for each table; ``jobs`` are those wanted and those done, ``drawn`` the sheets."""
     wanted, done = jobs
     parts = ["# The paper's tables\n", budget_text(cfg, [job for job in wanted if job not in done])]
     for name, rows in tables.items():
         parts += [f"## {TITLES[name]}\n", table(rows), order(rows)]
         write_csv(to / f"{name}.csv", rows)
-    parts += measured_once(extra, paper_seconds, cfg) if extra else []
-    parts += [
-        f"## {title}\n\n![{title}]({name}.png)\n" for name, title in SHEETS.items() if (to / f"{name}.png").exists()
-    ]
+    parts += measured_once(extra, paper_seconds) if extra else []
+    parts += [f"## {title}\n\n![{title}]({name}.png)\n" for name, title in SHEETS.items() if name in drawn]
     commands = "\n".join(f"python {' '.join(command(job, cfg))}" for job in done)
     parts.append(f"## Commands\n\n```sh\n{commands}\n```\n")
     with atomic_write(to / "tables.md") as path:
-        path.write_text("\n".join(part for part in parts if part))
+        path.write_text("\n".join(part for part in parts if part), encoding="utf-8")

@@ -69,7 +69,7 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
     except (ValueError, RuntimeError) as error:
         raise UserError(str(error)) from None
     pool = getattr(train_pairs, "pool", None)
-    if cfg.init is not None:
+    if cfg.init is not None and state is None:
         initialize(generator, cfg.init)
     elif pool is not None:
         cast(Any, generator).fit_descriptors(pool.descriptors)

@@ -3,16 +3,18 @@
 import csv
 import json
 import math
-import subprocess
+import os
+import signal
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from PIL import Image
 from recipe_runs import recipe_module
 from safetensors.torch import save_file
 
@@ -68,8 +70,8 @@ def finished_run(folder: Path, seed: int, **changes: Any) -> torch.nn.Module:
     net = MODEL.build()
     save_file({k: v.contiguous() for k, v in net.state_dict().items()}, folder / "model.safetensors")
     (folder / "model.json").write_text(json.dumps(asdict(MODEL)))
-    config = {"preset": "tiny", "batch": 4, "seed": seed, "data": "humans", "steps": 2} | changes
-    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "config.json").write_text("{}")
+    (folder / "budget.json").write_text(json.dumps({"preset": "tiny", "batch": 4, "pairs": 8} | changes))
     (folder / "summary.json").write_text("{}")
     return net.eval()
 
@@ -105,6 +107,10 @@ def test_every_command_is_one_that_its_recipe_takes(config: Any, monkeypatch: py
         monkeypatch.setattr(sys, "argv", [file, *flags])
         parsed = settings.parse(recipe_module(Path(file).stem).PRESETS, None)
         assert (parsed.seed, parsed.steps, parsed.batch, parsed.data) == (1, 2, 4, "humans")
+        file, *flags = train.command(train.Job("humans", system, 1), replace(config, minutes=5.0, preset="small"))
+        monkeypatch.setattr(sys, "argv", [file, *flags])
+        parsed = settings.parse(recipe_module(Path(file).stem).PRESETS, None)
+        assert (parsed.steps, parsed.minutes) == (None, 5.0), "the preset's steps do not count"
 
 
 def test_tables_hold_means_and_spreads_over_runs(tables: Callable[..., Path], tmp_path: Path) -> None:
@@ -131,40 +137,57 @@ def test_measurements_are_made_once(
 ) -> None:
     finished_run(tmp_path / "humans-npt-0", 0)
     before = (tables() / "tables.md").read_text()
-    monkeypatch.setattr(recipe_module("paper_tables"), "measure", None)
+    for module in ("paper_tables", "_tables_measure"):
+        monkeypatch.setattr(recipe_module(module), "measure", None)
     assert (tables() / "tables.md").read_text() == before
+    with pytest.raises(TypeError):  # another number of pairs is another measurement
+        tables("--emd-pairs", 1)
 
 
 def test_a_run_with_another_budget_is_refused(tables: Callable[..., Path], tmp_path: Path) -> None:
-    finished_run(tmp_path / "humans-npt-0", 0, steps=3)
-    with pytest.raises(recipe_module("_run").UserError, match=r"humans-npt-0 was trained with \{'steps': 3\}"):
+    finished_run(tmp_path / "humans-npt-0", 0, pairs=12)
+    with pytest.raises(recipe_module("_run").UserError, match=r"humans-npt-0 was begun with the budget .*'pairs': 12"):
         tables()
 
 
-def test_training_shares_descriptors_and_stops_at_a_failure(config: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_shares_descriptors_and_goes_on_after_a_failure(config: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     train, ran = recipe_module("_tables_train"), []
-    status = {"xdualnet": 3}
+    status = {"cycle": 3}
 
-    def run(words: list[str], **_: Any) -> Any:
+    def run_to_end(words: list[str], environment: dict[str, str]) -> int:
         folder = config.out / words[words.index("--name") + 1]
         ran.append(folder.name)
-        if (folder / "pool_train.safetensors").exists():
+        if len(ran) > 1:
             assert (folder / "pool_train.safetensors").read_text() == "pool"
-        else:
-            (folder / "pool_train.safetensors").write_text("pool")
-        (folder / "summary.json").write_text("{}")
-        return SimpleNamespace(returncode=status.get(folder.name.split("-")[1], 0))
+        (folder / "pool_train.safetensors").write_text("pool")
+        (folder / "config.json").write_text("{}")
+        result = status.get(folder.name.split("-")[1], 0)
+        if result == 0:
+            (folder / "summary.json").write_text("{}")
+        return result
 
-    monkeypatch.setattr(subprocess, "run", run)
-    wanted = [train.Job("humans", system, 0) for system in ("corenet3d", "cycle", "xdualnet", "npt")]
-    with pytest.raises(recipe_module("_run").UserError, match="ended with status 3"):
-        list(train.train_missing(wanted, config))
-    assert ran == ["humans-corenet3d-0", "humans-cycle-0", "humans-xdualnet-0"]
-    first, second = (config.out / name / "pool_train.safetensors" for name in ran[:2])
-    assert first.samefile(second)
-    status["xdualnet"] = 0
-    (config.out / "humans-xdualnet-0" / "summary.json").unlink()
-    assert [job.system for job in train.train_missing(wanted, config)] == ["xdualnet", "npt"], "what is done stays done"
+    monkeypatch.setattr(train, "run_to_end", run_to_end)
+    wanted = [train.Job("humans", system, 0) for system in ("corenet3d", "cycle", "npt")]
+    failures = {job.system: failure for job, failure in train.train_missing(wanted, config)}
+    assert failures["corenet3d"] is failures["npt"] is None
+    assert failures["cycle"].endswith("ended with status 3") and "recipes/cycle_baseline.py" in failures["cycle"]
+    status.clear()
+    assert [job.system for job, _ in train.train_missing(wanted, config)] == ["cycle"], "what is done stays done"
+    for other in (replace(config, pairs=12), replace(config, minutes=8.0)):
+        with pytest.raises(recipe_module("_run").UserError, match="humans-corenet3d-0 was begun with the budget"):
+            train.finished(wanted[0], other)
+
+
+def test_a_recipe_is_waited_for_when_interrupted() -> None:
+    train = recipe_module("_tables_train")
+    slow = "import time; time.sleep(1.5); raise SystemExit(7)"
+    timer = threading.Timer(0.7, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    assert train.run_to_end([sys.executable, "-c", slow], dict(os.environ)) == 7, "not killed half-way"
+    timer.join()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with pytest.raises(KeyboardInterrupt):
+        train.run_to_end([sys.executable, "-c", "raise SystemExit(130)"], dict(os.environ))
 
 
 def test_the_order_of_methods_says_where_spreads_overlap() -> None:
@@ -173,12 +196,25 @@ def test_the_order_of_methods_says_where_spreads_overlap() -> None:
     def row(title: str, mean: float, spread: float, paper: float) -> Any:
         return write.Row(title, {"pmd": (mean, spread)}, 3, {"pmd": paper})
 
-    rows = [row("a", 3.0, 0.1, 1.0), row("b", 2.0, 0.1, 2.0), row("c", 2.05, 0.1, 3.0)]
-    assert write.order(rows).startswith("PMD here: b ~ c < a. Paper: a < b < c.")
-    assert "Single runs" not in write.order(rows)
-    assert "Single runs" in write.order(
-        [replace(r, runs=1, figures={"pmd": (r.figures["pmd"][0], math.nan)}) for r in rows]
-    )
+    rows = [row("a", 3.0, 0.1, 1.0), row("b", 2.0, 0.1, 2.0), row("c", 2.15, 0.1, 3.0)]
+    assert write.order(rows).startswith("PMD here: b ~ c < a. Paper: a < b < c.")  # two standard errors are 0.163
+    single = [replace(r, runs=1, figures={"pmd": (r.figures["pmd"][0], math.nan)}) for r in rows]
+    assert write.order(single).startswith("PMD here: b ? c ? a.")
+
+
+def test_sheets_are_drawn_of_what_there_is(config: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    sheets, train = recipe_module("_tables_sheets"), recipe_module("_tables_train")
+    monkeypatch.setattr(sheets, "NOISE", (0.0, 5.0))
+    for name in ("topology_sheet", "noise_sheet"):  # pictures of the shipped weights: seconds each, tried below
+        monkeypatch.setattr(sheets, name, lambda path: path.write_bytes(b""))
+    finished_run(tmp_path / "humans-npt-0", 0)
+    noise = sheets.noise_curve(count=1)
+    assert all(len(noise[name]) == 2 and min(noise[name]) > 0 for name in sheets.WEIGHTS)
+    drawn = sheets.draw_sheets(tmp_path, [train.Job("humans", "npt", 0)], noise, lambda job: [1.0, 2.0, 3.0], config)
+    assert drawn == ["comparison-humans", "topologies", "correspondence", "noise", "noise_curve"]
+    with Image.open(tmp_path / "comparison-humans.png") as picture:  # two of the four rows exist
+        colors = picture.convert("RGB").getcolors(maxcolors=1 << 16)
+    assert colors is not None and len(colors) > 40, "an empty sheet has white alone"
 
 
 def test_bad_counts_are_named(tables: Callable[..., Path]) -> None:
@@ -186,3 +222,7 @@ def test_bad_counts_are_named(tables: Callable[..., Path]) -> None:
         tables("--batch", 3)
     with pytest.raises(recipe_module("_run").UserError, match="there are 400 test pairs"):
         tables("--eval-pairs", 500)
+    with pytest.raises(recipe_module("_run").UserError, match="cannot be negative"):
+        tables("--large-pairs", -1)
+    with pytest.raises(recipe_module("_run").UserError, match="twice: humans humans"):
+        tables("--data", "humans", "humans")

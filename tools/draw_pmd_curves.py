@@ -12,8 +12,11 @@ from meshkit.viz import plot_curves
 
 def curve(run: Path) -> tuple[list[float], list[float]]:
     """Minutes, and PMD at them; the last evaluation, on all pairs, is not of the curve."""
-    records = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-    points = [(record["seconds"] / 60, record["eval"]["pmd"]) for record in records if "eval" in record]
+    try:
+        records = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines() if line.endswith("}")]
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"error: {run}/log.jsonl: {error}") from None
+    points = [(r["seconds"] / 60, r["eval"]["pmd"]) for r in records if "pmd" in r.get("eval", {})]
     if not points:
         raise SystemExit(f"error: {run}/log.jsonl holds no evaluation: train with a smaller --eval-every")
     return [minutes for minutes, _ in points], [pmd for _, pmd in points]

@@ -26,7 +26,7 @@ from meshkit.batching import center
 from meshkit.data import load_humans, load_shipped
 from meshkit.io import atomic_write, simplify
 from meshkit.metrics import pmd
-from meshkit.models import PretrainedTransfer, load_generator
+from meshkit.models import PretrainedTransfer, load_generator, pretrained_names
 from meshkit.transfer import measure_confidence, usual_range
 
 ROOT = Path(__file__).parents[1]
@@ -240,6 +240,8 @@ def main() -> None:
         config, summary, machine = (
             json.loads((args.run / f"{part}.json").read_text()) for part in ("config", "summary", "machine")
         )
+        if config.get("init") not in (None, *pretrained_names()):
+            raise ValueError(f"it began with --init {config['init']}, which others do not have")
         body, split = load_shipped(config["data"], config["vertices"])
         system = SYSTEMS[recipe_of(config)][1]
     except (OSError, ValueError) as error:

@@ -115,7 +115,7 @@ def plot_curves(
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import StrMethodFormatter
+    from matplotlib.ticker import LogLocator, StrMethodFormatter
 
     curves = {name: (np.asarray(x, float), np.asarray(y, float)) for name, (x, y) in series.items()}
     if not curves:
@@ -135,6 +135,7 @@ def plot_curves(
         low, high = axes.get_ylim()
         if high < 100 * low:  # few decades: plain numbers, in between as well
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
             axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
