@@ -147,6 +147,12 @@ def test_files_that_pages_name_exist() -> None:
     assert not [(page, file) for page, file in named if not (ROOT / file).exists()]
 
 
+def test_clean_removes_what_a_build_leaves() -> None:
+    ignored = [line.strip("/") for line in (ROOT / ".gitignore").read_text().split() if line.startswith("docs/")]
+    recipe = (ROOT / "Makefile").read_text().split("\nclean:")[1].split("\n\n")[0].split()
+    assert ignored and not set(ignored) - set(recipe)
+
+
 @pytest.mark.parametrize("name", PAGES)
 def test_page_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
