@@ -37,7 +37,8 @@ scatter: $(READY) ## build the optional torch-scatter backend in .venv, seven mi
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/test_scatter.py
 
 clean: ## remove the virtual environment, caches and builds (runs/ is kept)
-	rm -rf $(VENV) build dist docs/_build docs/auto_examples docs/api .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage *.egg-info
+	rm -rf docs/_build docs/auto_examples docs/api docs/sg_execution_times.rst
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Re-made only when the pins or the package's metadata change; an interrupted set-up leaves no stamp and starts again.

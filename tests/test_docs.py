@@ -92,11 +92,38 @@ def test_equations_are_drawn_and_nothing_is_fetched(site: Path) -> None:
         assert not fetched, file.name
 
 
-def test_links_between_pages_hold(site: Path) -> None:
-    """Links of the Markdown are checked as GitHub follows them; Sphinx has checked its own."""
-    for page in DOCS.glob("*.md"):
-        for link in re.findall(r"\]\((?!https?://|#)([^)#\s]+)", page.read_text()):
-            assert (DOCS / link).exists(), f"{page.name}: {link}"
+def test_links_between_pages_hold() -> None:
+    """Links of the Markdown, to files and to headings, as GitHub follows them."""
+    targets = [(page.name, *link) for page in DOCS.glob("*.md") for link in links(page.read_text())]
+    assert len(targets) > 60
+    for page, path, anchor in targets:
+        file = DOCS / (path or page)
+        assert file.exists(), f"{page}: {path}"
+        assert not anchor or anchor in headings(file.read_text()), f"{page}: {path}#{anchor}"
+
+
+def test_what_counts_as_a_link_and_a_heading() -> None:
+    text = "[a](b.md#c) ![d](e.png) [f](#g) <https://h.i> [j](https://k.l) $x[0](1)$\n```\nm[n](o)\n```\n`p[q](r)`\n"
+    assert links(text) == [("b.md", "c"), ("e.png", ""), ("", "g")]
+    assert headings("# Of `N x M`, *measured*\n## Two\n```\n# no heading\n```\n") == {"of-n-x-m-measured", "two"}
+
+
+def prose(text: str) -> str:
+    """Without blocks of code."""
+    return re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def links(text: str) -> list[tuple[str, str]]:
+    """File and anchor of each link to this repository."""
+    text = re.sub(r"`[^`\n]+`\]", "]", prose(text))  # code as the text of a link
+    text = re.sub(r"(\$\$?).*?\1|`[^`\n]+`", "", text, flags=re.DOTALL)
+    return re.findall(r"\]\((?!https?://)([^)#\s]*)#?([^)\s]*)\)", text)
+
+
+def headings(text: str) -> set[str]:
+    """Anchors of the headings."""
+    titles = re.findall(r"^#+ (.+)$", prose(text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 def test_tests_that_pages_name_exist() -> None:
@@ -108,9 +135,22 @@ def test_tests_that_pages_name_exist() -> None:
         assert f"def {name}(" in (ROOT / "tests" / file).read_text(), f"{page}: {file}::{name}"
 
 
-def test_every_benchmark_and_question_is_on_its_page() -> None:
-    text = (DOCS / "benchmarks.md").read_text()
-    assert not [p.name for p in (ROOT / "benchmarks").glob("*.py") if f"benchmarks/{p.name}" not in text]
+def test_every_benchmark_is_on_its_page_and_no_other() -> None:
+    listed = set(re.findall(r"^\| `.*?benchmarks/(\w+\.py)", (DOCS / "benchmarks.md").read_text(), re.MULTILINE))
+    assert listed == {p.name for p in (ROOT / "benchmarks").glob("*.py") if not p.name.startswith("_")}
+
+
+def test_files_that_pages_name_exist() -> None:
+    pattern = re.compile(r"(?:python|`)\s*((?:benchmarks|recipes|examples|tools|tests)/[\w/]+\.py)")
+    named = [(page.name, file) for page in DOCS.glob("*.md") for file in pattern.findall(page.read_text())]
+    assert len(named) > 40
+    assert not [(page, file) for page, file in named if not (ROOT / file).exists()]
+
+
+def test_clean_removes_what_a_build_leaves() -> None:
+    ignored = [line.strip("/") for line in (ROOT / ".gitignore").read_text().split() if line.startswith("docs/")]
+    recipe = (ROOT / "Makefile").read_text().split("\nclean:")[1].split("\n\n")[0].split()
+    assert ignored and not set(ignored) - set(recipe)
 
 
 @pytest.mark.parametrize("name", PAGES)

@@ -499,6 +499,7 @@ def test_paper_preset_is_the_printed_setting(recipe: ModuleType, monkeypatch: py
     assert (cfg.lambda_rec, cfg.lambda_corr, cfg.lambda_edge) == (2000, 200, 1)
     assert (cfg.arap_from, cfg.arap_fraction, cfg.arap_iters, cfg.arap_energy) == (0.75, 0.1, 50, "spokes")
     assert (cfg.lr, cfg.warmup, cfg.decay_from) == (1e-4, 0, 0.5)
+    assert (cfg.betas, cfg.adam_eps) == ((0.0, 0.9), 1e-3)  # not printed: the released code's
     assert (cfg.resample, cfg.eval_pairs, cfg.arap, cfg.corr) == (False, 400, True, True)
     # The command line gives the same, and single values can be changed.
     parsed = []

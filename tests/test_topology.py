@@ -112,7 +112,11 @@ def test_batches_equal_the_loop_and_padding_changes_nothing(function) -> None:
         assert not got[b, len(expected) :].any()
 
 
-@pytest.mark.parametrize("function", [cotangent_weights, mass_matrix, face_normals, vertex_normals])
+def dense_laplacian(verts: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+    return cotangent_laplacian(verts, faces).to_dense()
+
+
+@pytest.mark.parametrize("function", [cotangent_weights, dense_laplacian, mass_matrix, face_normals, vertex_normals])
 def test_gradients(function) -> None:
     generator = torch.Generator().manual_seed(3)
     verts = torch.randn(5, 3, dtype=torch.float64, generator=generator, requires_grad=True)

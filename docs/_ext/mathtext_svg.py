@@ -23,6 +23,8 @@ SPELLINGS = [
     (r"\\[Bb]igg?[lr]?\s*(?=[()\[\]/|\\])", ""),
     (r"\\operatorname\*", r"\\operatorname"),
     (r"\\textstyle", ""),
+    (r"\\top(?![a-zA-Z])", r"{\\mathsf{T}}"),  # a relation there, with space around it
+    (r"(\\mathrm\{\w\})\s*(\\log)", r"\1\\,\2"),
     (r"\\(le|ge|ne)(?![a-zA-Z])", r"\\\1q"),
     (r"\\neqq", r"\\neq"),
     (r"\\(mathbf|mathcal|mathrm)\s+(\w)", r"\\\1{\2}"),

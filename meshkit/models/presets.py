@@ -148,8 +148,8 @@ def corenet3d(preset: str = "paper", *, released: bool = False) -> PoseTransferG
     """3D-CoreNet's generator: X-DualNet's, but with a pointwise extractor and two maps before the matching.
 
     Args:
-        preset: ``"paper"`` (extractor 64/128/256 with 4 residual blocks, blocks 1024/512/256) or ``"tiny"`` (16/32/64
-            with 2, the rest as ``xdualnet("tiny")``).
+        preset: ``"paper"`` (extractor 64/128/256 with 4 residual blocks, blocks 1024/512/256), ``"tiny"`` (16/32/64
+            with 2, the rest as ``xdualnet("tiny")``) or ``"small"`` (32/64/128 with 4, the rest likewise).
         released: as in :func:`xdualnet`.
 
     Example:
@@ -164,8 +164,8 @@ def npt(variant: str = "maxpool", *, preset: str = "paper") -> NPT:
 
     Args:
         variant: ``"maxpool"``, or ``"original"`` for meshes of equal vertex counts.
-        preset: ``"paper"`` (encoder 64/128/1024, blocks 1027/513/256, which is also the released layout) or ``"tiny"``
-            (32/64/253, blocks 256/128/64).
+        preset: ``"paper"`` (encoder 64/128/1024, blocks 1027/513/256, which is also the released layout), or ``"tiny"``
+            and ``"small"``, which are one (32/64/253, blocks 256/128/64).
 
     Example:
         >>> sum(p.numel() for p in npt(preset="tiny").parameters()) < 500_000
