@@ -155,7 +155,7 @@ for name, history in curves.items():
     right.plot(step, error, label=name)
 for name, error in baselines.items():
     right.axhline(error, color="0.6", linewidth=0.8, linestyle="--")
-    right.text(1, error - 0.04, name, color="0.4", fontsize=8, ha="left", va="top")
+    right.text(steps, error - 0.04, name, color="0.4", fontsize=8, ha="right", va="top")
 left.set(xlabel="step", ylabel="reconstruction loss (1e-3 m²)", title="trained: A' to A, B' to B", ylim=(0, None))
 right.set(xlabel="step", ylabel="PMD (1e-3 m²)", title="wanted: G(A, B) to the truth", ylim=(0, None))
 left.legend(frameon=False)
@@ -164,7 +164,8 @@ left.legend(frameon=False)
 # What the objective sees, and what it does not
 # ---------------------------------------------
 # If G(A, B) = B, then A' = G(B, A) = A and B' = G(B, B) = B, and the reconstruction loss is zero. The first training
-# starts near that and closes in on it: its output has B's size. If G(A, B) = A, the loss is zero as well. Two things rule the copies out:
+# starts near that and closes in on it: its output has B's size. If G(A, B) = A, the loss is zero as well. Two things
+# rule the copies out:
 #
 # - *Copying A*: by the generator, which reads only lengths of A. X-DualNet has its matching for that: the output starts
 #   from B's vertices, and A enters through norms.
@@ -179,7 +180,7 @@ for line, k in zip(axes, rows, strict=True):
     everything = torch.cat(list(shapes.values()))
     bounds = torch.stack([everything.amin(0), everything.amax(0)])
     for axis, (name, x) in zip(line, shapes.items(), strict=True):
-        axis.imshow(render(x, body.faces, size=(230, 300), bounds=bounds, scale=1.05))
+        axis.imshow(render(x, body.faces, size=(230, 300), bounds=bounds, scale=1.6))
         axis.axis("off")
         if k == rows[0]:
             axis.set_title(name, fontsize=10)
