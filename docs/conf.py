@@ -44,7 +44,7 @@ napoleon_use_rtype = False
 maximum_signature_line_length = 100
 python_use_unqualified_type_names = True
 add_module_names = False
-# A reference to a name of meshkit must resolve. There is no network while building, so others' names stay plain text.
+# A reference to a name of meshkit must resolve. The build needs no network, so others' names stay plain text.
 nitpicky = True
 # Nor need types resolve that only appear in signatures.
 nitpick_ignore_regex = [

@@ -158,8 +158,8 @@ for name, moved in zip(patches, shift.detach(), strict=True):
     print(f"{name:10s} moved by {float(moved.norm()):.2f} m")
 
 figure, axis = plt.subplots(num="handles_curve", figsize=(5.5, 2.8), layout="constrained")
-axis.semilogy(range(1, steps + 1), curve)
-axis.set(xlabel="step", ylabel="distance to the targets (cm)")
+axis.plot(range(1, steps + 1), curve)
+axis.set(xlabel="step", ylabel="distance to the targets (cm)", ylim=(0, None))
 
 # %%
 # Green is around the knee and the elbow. All six handles took part, also those that were to stay: give them a loss of

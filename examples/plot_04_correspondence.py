@@ -13,7 +13,7 @@ import torch
 from meshkit.batching import center
 from meshkit.data import load_humans
 from meshkit.descriptors import wave_kernel_signature
-from meshkit.models.symmetry import mirror_labels
+from meshkit.models import mirror_labels
 from meshkit.neighbors import knn
 from meshkit.ot import sinkhorn
 from meshkit.viz import correspondence_figure, error_heat_map

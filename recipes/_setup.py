@@ -54,8 +54,9 @@ def given(cfg: Any) -> list[str]:
         return []
     usual = presets[cfg.preset]
     names = [*(f.name for f in fields(cfg) if f.name != "model"), *(f"model.{f.name}" for f in fields(cfg.model))]
-    # A recipe may set the architecture itself.
-    return [name for name in names if name != "model.architecture" and value_of(cfg, name) != value_of(usual, name)]
+    # A recipe may set the architecture itself. A preset differs from itself in nothing: the command line is asked.
+    differ = [name for name in names if name != "model.architecture" and value_of(cfg, name) != value_of(usual, name)]
+    return [*(["preset"] if any(word.startswith("--preset") for word in sys.argv[1:]) else []), *differ]
 
 
 def value_of(cfg: Any, flag: str) -> Any:

@@ -233,6 +233,28 @@ def test_pool_is_reproducible_with_any_number_of_workers(pool, humans):
     assert all(torch.equal(once.state_dict()[name], value) for name, value in pool.state_dict().items())
 
 
+def test_a_pool_made_here_keeps_to_one_thread(humans, monkeypatch):
+    """Two such processes on two cores would fight for them."""
+    from meshkit.data import pool as module
+
+    seen = []
+
+    def describe_and_look(*arguments, **options):
+        seen.append(torch.get_num_threads())
+        return describe(*arguments, **options)
+
+    monkeypatch.setattr(module, "intrinsic_descriptors", describe_and_look)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        MeshPool.build(humans, torch.arange(3), torch.arange(3), 2, num_signatures=2, num_eigenpairs=4)
+        after = torch.get_num_threads()
+    finally:
+        torch.set_num_threads(threads)
+    assert seen == [1, 1]
+    assert after == 2
+
+
 def test_pool_seed_and_arguments(humans, capsys):
     few, many = torch.arange(50), torch.arange(60)
     first = MeshPool.build(humans, few, many, 8, num_signatures=4, num_eigenpairs=8, progress=True)

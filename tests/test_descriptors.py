@@ -13,6 +13,7 @@ from torch import Tensor
 
 from meshkit.data import load_humans
 from meshkit.descriptors import (
+    _solvers,
     heat_kernel_signature,
     intrinsic_descriptors,
     laplacian_eigenpairs,
@@ -764,3 +765,30 @@ def test_option_errors():
         wave_kernel_signature(verts[None], faces, mask=hidden)
     with pytest.raises(ValueError, match="num_signatures must be at least 2, got 1"):
         heat_kernel_signature(verts, faces, num_signatures=1)
+
+
+def test_the_fast_method_keeps_to_one_thread(monkeypatch):
+    """Threads of NumPy's own cannot be bounded from here, so it must not do the dense algebra."""
+    seen = []
+    inner = _solvers._ritz_pairs
+
+    def look(*arguments):
+        seen.append(torch.get_num_threads())
+        return inner(*arguments)
+
+    def refuse(*arguments, **options):
+        raise AssertionError("dense algebra in NumPy")
+
+    monkeypatch.setattr(_solvers, "_ritz_pairs", look)
+    for name in ("qr", "eigh"):
+        monkeypatch.setattr(f"numpy.linalg.{name}", refuse)
+    body = load_humans(1000)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        laplacian_eigenpairs(body.template, body.faces, 8, method="fast")
+        after = torch.get_num_threads()
+    finally:
+        torch.set_num_threads(threads)
+    assert seen == [1]
+    assert after == 2

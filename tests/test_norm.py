@@ -2,6 +2,7 @@
 
 import io
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.nn.functional import conv1d
 
 from meshkit import norm as norms
+from meshkit.nn import ConditionalResBlock
 from meshkit.norm import (
     SPADE,
     AdaIN,
@@ -126,6 +128,24 @@ def test_padded_batch_equals_the_loop(garbage, variant, walk):
         assert (padded[~mask] == 0).all()
     for gradient, truth in zip(gradients[2:], truths[6:], strict=True):
         assert_near(gradient, truth, 1e-11)
+
+
+@variants
+@pytest.mark.parametrize(("gate", "degree"), [(None, 2), ("sigmoid", 1)])
+def test_elain_squares_the_scale_of_its_input_unless_gated(variant, gate, degree):
+    """Without bound, w grows with the mean, and w sigma and w mu with its square; a block has two ElaINs in a row."""
+    torch.manual_seed(0)
+    x, cond = rand(1, 8, C) + 1, rand(1, 8, D, seed=1)
+
+    def growth(layer: torch.nn.Module) -> float:
+        with torch.no_grad():
+            small, large = (layer(scale * x, cond).abs().amax().log10() for scale in (1e6, 1e7))
+        return float(large - small)
+
+    norm = partial(ElaIN, variant=variant, gate=gate)
+    block = ConditionalResBlock(C, D, norm=norm, spectral=False).double()
+    assert growth(norm(C, D).double()) == pytest.approx(degree, abs=0.01)
+    assert growth(block) == pytest.approx(degree**2, abs=0.01)
 
 
 @variants

@@ -31,7 +31,6 @@ carried = small.carry(posed)
 distance = (carried - true).norm(dim=1)
 print(f"carried to 6890 vertices: mean error {1000 * distance.mean():.2f} mm")
 
-options = {"size": (220, 340), "bounds": torch.stack([true.min(0).values, true.max(0).values]), "supersample": 3}
 size, bounds = (220, 340), torch.stack([true.min(0).values, true.max(0).values])
 pictures = [
     render(full.template, full.faces, size=size, supersample=3),

@@ -115,7 +115,8 @@ class MeshPool:
         context = multiprocessing.get_context("spawn")
         bar = partial(tqdm, total=len(verts), desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True)
         if workers <= 1:
-            signatures = list(bar(map(compute, verts)))
+            with _one_thread_here():
+                signatures = list(bar(map(compute, verts)))
         else:
             with _one_thread_each(), ProcessPoolExecutor(workers, mp_context=context) as executor:
                 signatures = list(bar(executor.map(compute, [v.numpy() for v in verts], chunksize=8)))
@@ -124,6 +125,17 @@ class MeshPool:
     def state_dict(self) -> dict[str, Tensor]:
         """The four tensors, to be saved."""
         return {name: getattr(self, name).contiguous() for name in self.__dataclass_fields__}
+
+
+@contextmanager
+def _one_thread_here() -> Iterator[None]:
+    """Small matrices gain nothing from threads, and lose much where other processes share the cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @contextmanager

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -43,7 +45,6 @@ def block_krylov(matrix: Any, k: int, positions: np.ndarray, scale: np.ndarray) 
     end of the spectrum; and they share no symmetry, so that on a symmetric surface no family of eigenvectors is out of
     their reach. (Constants would be a bad choice: an eigenvector in the first block adds nothing to the later ones.)
     """
-    import numpy as np
     from scipy.sparse.csgraph import connected_components
 
     if connected_components(matrix, directed=False)[0] > 1:
@@ -52,15 +53,27 @@ def block_krylov(matrix: Any, k: int, positions: np.ndarray, scale: np.ndarray) 
     num = matrix.shape[0]
     size = max(9 * k // 4, k + 2 * _BLOCK)
     if 2 * size > num:
-        eigenvalues, vectors = np.linalg.eigh(matrix.toarray())
-        return eigenvalues[:k], vectors[:, :k]
-    solve = _inverse(matrix, _BLOCK_SHIFT)
-    basis = np.empty((num, size), order="F")
-    projected = np.zeros((size, size))
-    basis[:, :_BLOCK] = np.linalg.qr(_waves(positions, scale) / scale[:, None])[0]
+        values, vectors = torch.linalg.eigh(torch.from_numpy(matrix.toarray()))
+        return values[:k].numpy(), vectors[:, :k].numpy()
+    # Dense algebra is left to torch, on one thread: NumPy's own threads spin, and where several processes share the
+    # cores, blocks as small as these take fifty times as long.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        pairs = _ritz_pairs(_inverse(matrix, _BLOCK_SHIFT), k, size, _waves(positions, scale) / scale[:, None])
+    finally:
+        torch.set_num_threads(threads)
+    # The space may be exhausted, as on sheets that coincide, which functions of the position cannot tell apart.
+    return lanczos(matrix, k, 0.0) if pairs is None else pairs
+
+
+def _ritz_pairs(solve: Any, k: int, size: int, start: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    basis = torch.empty(size, len(start), dtype=torch.float64).T
+    projected = torch.zeros(size, size, dtype=torch.float64)
+    basis[:, :_BLOCK] = torch.linalg.qr(torch.from_numpy(start))[0]
     before, low, high = 0, 0, _BLOCK
     while True:
-        image = solve(basis[:, low:high])
+        image = torch.from_numpy(solve(basis[:, low:high].numpy()))
         # Three-term recurrence: in exact arithmetic the image has parts along the last two blocks only.
         last = basis[:, before:high]
         parts = last.T @ image
@@ -69,15 +82,15 @@ def block_krylov(matrix: Any, k: int, positions: np.ndarray, scale: np.ndarray) 
             break
         image -= last @ parts
         image -= basis[:, :high] @ (basis[:, :high].T @ image)
-        following, triangle = np.linalg.qr(image)
-        if np.abs(triangle.diagonal()).min() < 1e-12:
-            # The space is exhausted, as on sheets that coincide, which functions of the position cannot tell apart.
-            return lanczos(matrix, k, 0.0)
+        following, triangle = torch.linalg.qr(image)
+        if triangle.diagonal().abs().min() < 1e-12:
+            return None
         before, low, high = low, high, min(size, high + _BLOCK)
         basis[:, low:high] = following[:, : high - low]
         projected[low:high, before:low] = triangle[: high - low]
-    inverted, mixing = np.linalg.eigh((projected + projected.T) / 2)
-    return 1 / inverted[: -k - 1 : -1] - _BLOCK_SHIFT, basis @ mixing[:, : -k - 1 : -1]
+    inverted, mixing = torch.linalg.eigh((projected + projected.T) / 2)
+    lowest = torch.arange(size - 1, size - 1 - k, -1)
+    return (1 / inverted[lowest] - _BLOCK_SHIFT).numpy(), (basis @ mixing[:, lowest]).numpy()
 
 
 def _inverse(matrix: Any, shift: float) -> Any:

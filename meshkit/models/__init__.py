@@ -11,6 +11,7 @@ from meshkit.models.presets import GeneratorConfig, corenet3d, load_generator, n
 from meshkit.models.pretrained import PretrainedTransfer, load_pretrained, pretrained_names
 from meshkit.models.released import load_released_checkpoint
 from meshkit.models.stack import PoseTransferStack
+from meshkit.models.symmetry import mirror_labels
 
 __all__ = [
     "NPT",
@@ -27,6 +28,7 @@ __all__ = [
     "load_generator",
     "load_pretrained",
     "load_released_checkpoint",
+    "mirror_labels",
     "model_card",
     "npt",
     "pretrained_names",

@@ -65,7 +65,7 @@ class PoseTransferGenerator(nn.Module):
         normalize_plan: warp with the row-normalised plan (released code). ``False`` warps with the raw plan as the
             paper prints it, whose rows sum to 1/N, so that the warped mesh is N times too small.
         symmetry: in evaluation, given ``identity_faces``, look at the identity mesh's mirror image too, and let
-            :func:`~meshkit.models.symmetry.mirror_labels` choose for each vertex which of the two it is matched as.
+            :func:`~meshkit.models.mirror_labels` choose for each vertex which of the two it is matched as.
             Limbs that are exchanged by a mistaken matching are put right where they would be torn. Takes bodies
             whose left and right lie along x.
         released: the released code to the letter: its first convolution

@@ -42,7 +42,8 @@ def mirror_labels(
     Args:
         verts: ``(N, 3)`` the body.
         faces: ``(F, 3)`` its faces, consistently oriented.
-        targets: ``(N, 3)`` matched position of each vertex.
+        targets: ``(N, 3)`` matched position of each vertex, of a soft matching such as ``plan.barycentric(...)``:
+            single best matches jump from vertex to vertex, which tears every edge.
         mirrored: ``(N, 3)`` matched position of each vertex's mirror image.
         partner: ``(N,)`` int64, :math:`\sigma`; need not be an involution.
         slack: s, the stretch that costs nothing.
@@ -60,6 +61,7 @@ def mirror_labels(
         labels: see :func:`least_labels`.
 
     Example:
+        >>> from meshkit.models import mirror_labels
         >>> verts = torch.tensor([[-1.0, 0, 0], [1, 0, 0], [-1, 0, -1], [1, 0, -1], [0, 1, 0]])
         >>> faces = torch.tensor([[0, 4, 2], [1, 3, 4], [0, 2, 4], [1, 4, 3]])  # two shins that share a hip
         >>> swapped = verts[[0, 1, 3, 2, 4]]  # the feet have changed places
