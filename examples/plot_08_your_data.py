@@ -122,7 +122,7 @@ for path, reason in store.skipped:
 # Batches are padded, and a mask says which vertices are real; it is ``None`` where all are. Row by row: identity mesh,
 # pose mesh, and the truth, in the vertex order of the first.
 
-pairs = MeshPairs(store, length=64, seed=8)
+pairs = MeshPairs(store, length=64, seed=46)
 batch = next(iter(pair_loader(pairs, PairSampler(len(pairs), 3, stop=1))))
 
 
