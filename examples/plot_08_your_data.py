@@ -45,8 +45,8 @@ def show(picture):
 # %%
 # A body model of SMPL's layout
 # -----------------------------
-# A file of this layout holds a template, shape directions, pose correctives, skinning weights, a joint regressor and the
-# tree of joints. It is y up. Here all are taken from the shipped rig, turned to y up, with no correctives; the
+# A file of this layout holds a template, shape directions, pose correctives, skinning weights, a joint regressor and
+# the tree of joints. It is y up. Here all are taken from the shipped rig, turned to y up, with no correctives; the
 # regressor gives each joint the vertices around it.
 
 rig = load_humans(1000)
@@ -107,8 +107,8 @@ for who, index in enumerate((3, 50, 120, 7)):
 
 # %%
 # ``scan_pose_transfer`` reads the names, ``MeshStore`` parses the files once. With ``skip_bad=True`` a file that cannot
-# be read is named and left out; the gap in the grid of people and poses is no error, since only pairs whose ground truth
-# exists are drawn.
+# be read is named and left out; the gap in the grid of people and poses is no error, since only pairs whose ground
+# truth exists are drawn.
 
 entries = scan_pose_transfer(meshes)
 with warnings.catch_warnings(record=True) as caught:
@@ -174,11 +174,11 @@ assert len(before.components) == 4 and before.duplicate_faces == 1
 assert after.manifold and len(after.components) == 1 and after.flipped_edges == after.duplicate_verts == 0
 
 # %%
-# The torn rim is drawn in red: edges that belong to one face. Surfaces seen from inside are dark.
+# Red are the ends of edges that belong to one face only. Surfaces seen from inside are dark.
 
 
 def rim(verts, faces):
-    """Red at vertices of open edges, grey elsewhere."""
+    """Red at the ends of open edges, grey elsewhere."""
     edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1)[0]
     edges, times = edges.unique(dim=0, return_counts=True)
     colors = torch.full((len(verts), 3), 0.75)
@@ -195,8 +195,8 @@ captions = [f"{len(v)} vertices, holes: {r.boundary_loops}" for v, r in ((broken
 show(contact_sheet([pictures], column_titles=["as it came", "clean"], captions=[captions]))
 
 # %%
-# What is done to the clean mesh goes back to the file: its 2004 vertices follow, welded ones together, dropped ones with
-# the surface nearest to them. So a repaired mesh can be posed, and a texture made for the file still fits.
+# What is done to the clean mesh goes back to the file: its 2004 vertices follow, welded ones together, dropped ones
+# with the surface nearest to them. So a repaired mesh can be posed, and a texture made for the file still fits.
 
 turn = rotation_matrices(torch.tensor([0.3, -0.4, 1.2]))
 off = (clean.carry(clean.verts @ turn.T) - broken @ turn.T).abs().max()
@@ -207,8 +207,8 @@ assert off < 1e-5
 # Train on it
 # -----------
 # The recipes read all of these. Meshes from files come without signatures, hence ``--model.descriptors none``; where
-# vertex counts differ, X-DualNet must compare all vertices, ``--points None``. A damaged file stops a recipe with a line
-# that names it. A folder needs two people and two poses to train on, and two others of each to test on, as here. ::
+# vertex counts differ, X-DualNet must compare all vertices, ``--points None``. A damaged file stops a recipe with a
+# line that names it. A folder needs two people and two poses to train on, and two others of each to test on. ::
 #
 #     python recipes/xdualnet.py --data smpl:body.npz
 #     python recipes/xdualnet.py --data smal:smal_CVPR2017.pkl

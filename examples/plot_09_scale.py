@@ -27,9 +27,9 @@ folder = Path(tempfile.mkdtemp(prefix="meshkit-"))
 # %%
 # Who gets which pairs
 # --------------------
-# An update of ``--batch 2`` on two processes sees four pairs. The sampler is addressed by the step: it needs to know the
-# seed, the step, and which process of how many it serves. So the four are those of ``--batch 4`` on one process, and a
-# run that goes on at step 2 sees what it would have seen.
+# An update of ``--batch 2`` on two processes sees four pairs. The sampler is addressed by the step: it needs to know
+# the seed, the step, and which process of how many it serves. So the four are those of ``--batch 4`` on one process,
+# and a run that goes on at step 2 sees what it would have seen.
 
 
 def pairs_of(batch, **options):
@@ -139,8 +139,9 @@ figure.tight_layout()
 # Small networks on a large GPU
 # -----------------------------
 # A step of a small network is some ten thousand short kernels, which take longer to launch than to run. ``--graph``
-# records a step as a CUDA graph and replays it: for one process, without ``--compile``, on meshes of one size; steps with ARAP run as usual. With the
-# command below a step took 175 ms instead of 400 ms, beside four other runs on one H100. ::
+# records a step as a CUDA graph and replays it: for one process, without ``--compile``, on meshes of one size; steps
+# with ARAP run as usual. With the command below a step took 175 ms instead of 400 ms, beside four other runs on one
+# H100. ::
 #
 #     python recipes/xdualnet.py --preset small --graph
 
