@@ -1,6 +1,7 @@
 """Figures, animations and pages: what is where, in which colour; and that a browser draws the page."""
 
 import base64
+import html
 import io
 import json
 import re
@@ -16,6 +17,7 @@ import trimesh
 from PIL import Image
 
 from meshkit.data import load_humans
+from meshkit.transfer import save_page, transfer_pose
 from meshkit.viz import (
     correspondence_figure,
     error_colors,
@@ -279,27 +281,62 @@ def test_bad_pages_are_named(tmp_path: Path) -> None:
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
+def screenshot(page: Path, folder: Path, size: tuple[int, int]) -> np.ndarray:
+    """What a browser without a network shows."""
+    shot = folder / "shot.png"
+    flags = "--headless --no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
+    flags += " --disable-background-networking --no-first-run --disable-sync --hide-scrollbars"
+    command = [str(CHROMIUM), *flags.split(), f"--window-size={size[0]},{size[1]}", "--virtual-time-budget=4000"]
+    command += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={folder / 'profile'}"]
+    subprocess.run([*command, f"--screenshot={shot}", page.as_uri()], check=True, capture_output=True, timeout=120)
+    return np.asarray(Image.open(shot).convert("RGB")).astype(int)
+
+
+def outline(mask: np.ndarray) -> np.ndarray:
+    """The mask, cut to what it holds, in a common size."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    crop = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return np.asarray(Image.fromarray(crop).resize((60, 120)))
+
+
+def clay(picture: np.ndarray) -> np.ndarray:
+    """Where a body without colours of its own is drawn."""
+    return (picture @ [-1, 0, 1] > 15) & (picture.min(-1) > 30)
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_a_browser_draws_the_page(page: Path, tmp_path: Path) -> None:
     """Both bodies are drawn from within a file, in their colours, as the NumPy renderer draws them."""
-    shot = tmp_path / "shot.png"
-    flags = "--headless --no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
-    flags += " --disable-background-networking --no-first-run --disable-sync --hide-scrollbars --window-size=600,500"
-    command = [CHROMIUM, *flags.split(), "--virtual-time-budget=4000", f"--user-data-dir={tmp_path / 'profile'}"]
-    subprocess.run([*command, f"--screenshot={shot}", page.as_uri()], check=True, capture_output=True, timeout=120)
-    picture = np.asarray(Image.open(shot).convert("RGB")).astype(int)[60:-40]
-    clay = (picture @ [-1, 0, 1] > 15) & (picture.min(-1) > 30)
+    picture = screenshot(page, tmp_path, (600, 500))[60:-40]
+    left = clay(picture)
     red = (picture @ [1, -1, 0] > 60) & (picture[..., 1] < 90)
-    assert clay[:, :300].mean() > 0.03 and clay[:, 300:].mean() < 0.005
+    assert left[:, :300].mean() > 0.03 and left[:, 300:].mean() < 0.005
     assert red[:, 300:].mean() > 0.03 and red[:, :300].mean() < 0.005
     own = (render(VERTS[1], BODY.faces, size=(300, 400)) != 255).any(-1)
-
-    def outline(mask: np.ndarray) -> np.ndarray:
-        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        crop = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        return np.asarray(Image.fromarray(crop).resize((60, 120)))
-
     assert (outline(own) == outline(red[:, 300:])).mean() > 0.95
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_a_browser_draws_a_transfer_in_a_frame_of_another_page(tmp_path: Path) -> None:
+    """As in the documentation: identity, pose and result in thirds of the frame, on a page of another colour."""
+    result = transfer_pose(*((v, BODY.faces) for v in VERTS), weights="corenet3d-humans", refine=False)
+    save_page(tmp_path / "posed.html", result)
+    text = html.escape((tmp_path / "posed.html").read_text(encoding="utf-8"))
+    style = "position: absolute; left: 50px; top: 30px; border: 0"
+    frame = f'<iframe srcdoc="{text}" width="600" height="440" style="{style}"></iframe>'
+    outer = tmp_path / "outer.html"
+    outer.write_text(f'<body style="background: #ffd700">{frame}</body>', encoding="utf-8")
+    picture = screenshot(outer, tmp_path, (700, 500))
+    around = np.ones(picture.shape[:2], bool)
+    around[30:470, 50:650] = False
+    assert (picture[around] == [255, 215, 0]).all()
+    inside = picture[30:470, 50:650][95:-40]  # between the names and the footer
+    assert (inside.min(-1) > 200).mean() > 0.5
+    for number, (verts, faces) in enumerate(result.views):
+        drawn = clay(inside[:, 200 * number : 200 * (number + 1)])
+        expected = (render(verts, faces, size=(300, 400)) != 255).any(-1)
+        assert drawn.mean() > 0.03
+        assert (outline(expected) == outline(drawn)).mean() > 0.93
 
 
 def test_pyvista_draws_what_numpy_draws() -> None:
