@@ -25,8 +25,8 @@ torch.set_num_threads(1)
 # %%
 # Bodies
 # ------
-# A pool of 1000 posed bodies, each of a random identity in a random pose. Training takes two at random, A and B. For 64 test
-# pairs of unseen identities and poses the rig also tells the truth, A's body in B's pose.
+# A pool of 1000 posed bodies, each of a random identity in a random pose. Training takes two at random, A and B. For
+# 64 test pairs of unseen identities and poses the rig also tells the truth, A's body in B's pose.
 
 body = load_humans(1000)
 generator = torch.Generator().manual_seed(0)

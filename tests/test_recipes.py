@@ -347,7 +347,9 @@ def test_flags_that_do_not_count_on_resume_are_named(run: Any, capsys: pytest.Ca
     run("corenet3d", *FAST, "--resume", "--lr", 0.5, "--model.k", 5)
     said = capsys.readouterr().err
     assert "these do not count: " in said and "--lr (recorded: " in said and "--model.k (recorded: 4)" in said
-    assert "--steps" not in said
+    assert "--steps" not in said and "--preset" not in said
+    run("corenet3d", *FAST, "--resume", "--preset", "small", "--batch", 2)
+    assert "--preset (recorded: tiny)" in capsys.readouterr().err
 
 
 def test_meshes_of_both_sides_are_counted(run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
