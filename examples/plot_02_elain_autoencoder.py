@@ -105,7 +105,8 @@ def size(network):
 # Training
 # --------
 # The loss is the squared distance of 300 random vertices. All take the same steps. To be fair, the decoder with
-# concatenation is about as large as the one with ElaIN, which brings its time near as well; FiLM has half of both.
+# concatenation is about as large as the one with ElaIN, which brings its time near as well; FiLM has half the
+# parameters.
 
 steps = 200
 kinds = {"concatenation": (135, None), "FiLM, our own": (64, FiLM), "ElaIN": (64, ElaIN)}
@@ -137,11 +138,12 @@ for name, (width, norm) in kinds.items():
 # What came out
 # -------------
 # A concatenated code enters once, as a bias of the first layer. A norm lets it scale and shift the features at every
-# layer, which multiplies what a vertex is by what the body does. Step for step both norms are ahead of
-# concatenation, and FiLM by far; second for second ElaIN is not. The plainest norm wins: one scale and shift for all vertices is all that one code can say. ElaIN
-# weighs them against the statistics that the features had, and computes them vertex by vertex; it is made for
-# conditions that differ between vertices, as in X-DualNet, and here pays for both without use. One seed and 200 steps
-# say no more than that. Three times the steps bring concatenation to 2.4, in four times the time of FiLM.
+# layer, which multiplies what a vertex is by what the body does. Step for step both norms are ahead of concatenation,
+# and FiLM by far; second for second ElaIN is not. The plainest norm wins: one scale and shift for all vertices is all
+# that one code can say. ElaIN weighs them against the statistics that the features had, and computes them vertex by
+# vertex; it is made for conditions that differ between vertices, as in X-DualNet, and here pays for both without use.
+# One seed and 200 steps say no more than that. Three times the steps bring concatenation to 2.4, in four times the
+# time of FiLM.
 
 figure, axis = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
 for name, curve in curves.items():
@@ -151,9 +153,8 @@ axis.legend(frameon=False)
 
 # %%
 # Reconstructions of unseen bodies. FiLM has the poses and the sizes, and distorts heads and knees; concatenation is
-# still near the template in the second row. For bodies in one vertex order
-# a principal component analysis of the pool does better than any network here (0.1 with 48 components); the networks
-# are for comparing how a code gets in.
+# still near the template in the second row. For bodies in one vertex order a principal component analysis of the pool
+# does better than any network here (0.1 with 48 components); the networks are for comparing how a code gets in.
 
 chosen = [3, 12, 30]
 figure, axes = plt.subplots(len(chosen), 1 + len(outputs), figsize=(8.0, 7.5), layout="constrained")
