@@ -61,7 +61,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_memory": False,
     "min_reported_time": 1e9,  # run times differ from machine to machine
-    "capture_repr": (),
+    "capture_repr": ("_repr_html_",),  # the page to turn, the GIF
     "matplotlib_animations": False,
     "abort_on_example_error": True,
 }
