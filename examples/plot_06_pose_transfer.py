@@ -144,8 +144,8 @@ show(contact_sheet(rows[1:], column_titles=titles, captions=captions[1:], colorb
 # Animals
 # -------
 # ``xdualnet-animals`` is poor: seven minutes of training on 29 animals, without ground truth. Copying the identity
-# scores 20.4 on its 400 test pairs, copying the warp 9.8, the network 9.2. A test animal in a test pose. Its axes are given:
-# to find them would take most of the time, and here gives the same result.
+# scores 20.4 on its 400 test pairs, copying the warp 9.8, the network 9.2. A test animal in a test pose. Its axes are
+# given: to find them would take most of the time, and here gives the same result.
 
 animals = load_animals()
 row = animal_split().test_pairs[3][:, None]
