@@ -27,7 +27,8 @@ extensions = [
     "api_pages",
     "mathtext_svg",
 ]
-exclude_patterns = ["_build", "README.md", "auto_examples/**/*.ipynb", "auto_examples/*.py", "sg_execution_times.rst"]
+exclude_patterns = ["_build", "README.md", "auto_examples/**/*.ipynb", "auto_examples/*.py"]
+exclude_patterns += ["sg_execution_times.rst", "auto_examples/sg_execution_times.rst"]  # left by older builds
 
 # Pages are GitHub's Markdown first: dollar math, ordinary links, headings with GitHub's anchors.
 myst_enable_extensions = ["dollarmath"]
@@ -61,6 +62,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_memory": False,
     "min_reported_time": 1e9,  # run times differ from machine to machine
+    "write_computation_times": False,  # a page that fetches scripts
     "capture_repr": ("_repr_html_",),  # the page to turn, the GIF
     "matplotlib_animations": False,
     "abort_on_example_error": True,
