@@ -20,7 +20,7 @@ TITLES = {
     "comparison-animals": "Table 1, animals (paper: SMAL)",
     "norms": "Table 2, conditional normalisation, humans",
     "ablation": "Table 3, parts of X-DualNet, humans",
-    "humans-6890": "Humans at 6890 vertices, trained at 1000, one seed",
+    "humans-6890": "Humans at 6890 vertices, the first {large_pairs} pairs; trained at 1000 vertices, one seed",
 }
 
 SHEETS = {
@@ -155,7 +155,7 @@ def write_tables(
     wanted, done = jobs
     parts = ["# The paper's tables\n", budget_text(cfg, [job for job in wanted if job not in done])]
     for name, rows in tables.items():
-        parts += [f"## {TITLES[name]}\n", table(rows), order(rows)]
+        parts += [f"## {TITLES[name].format(large_pairs=cfg.large_pairs)}\n", table(rows), order(rows)]
         write_csv(to / f"{name}.csv", rows)
     parts += measured_once(extra, paper_seconds) if extra else []
     parts += [f"## {title}\n\n![{title}]({name}.png)\n" for name, title in SHEETS.items() if name in drawn]
