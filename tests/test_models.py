@@ -607,7 +607,7 @@ def test_presets():
         with pytest.raises(ValueError, match=r"preset must be one of \['paper', 'small', 'tiny'\], got 'huge'"):
             build("huge")
     with pytest.raises(ValueError, match='variant must be "maxpool" or "original"'):
-        npt("paper")
+        npt("huge")
 
 
 @pytest.mark.parametrize("spectral", [True, False])
