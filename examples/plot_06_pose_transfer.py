@@ -1,5 +1,5 @@
 """
-6. Pose transfer with the shipped weights
+Pose transfer with the shipped weights
 =========================================
 
 The pose of one mesh, the body of another: with the bare networks on meshes that stand as the networks expect, then with

@@ -1,5 +1,5 @@
 """
-7. Losses and metrics: conventions, and what each of them sees
+Losses and metrics: conventions, and what each of them sees
 ==============================================================
 
 "The Chamfer distance" is a family: squared or not, added or halved, summed or averaged. First each convention on a case

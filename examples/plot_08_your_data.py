@@ -1,5 +1,5 @@
 """
-8. Your data: SMPL files, folders of meshes, broken meshes
+Your data: SMPL files, folders of meshes, broken meshes
 ==========================================================
 
 Three ways in: a licensed body model, a folder of meshes, a mesh that nobody checked; and the command that trains on

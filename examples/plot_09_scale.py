@@ -1,5 +1,5 @@
 """
-9. Scale: several processes, larger batches, going on
+Scale: several processes, larger batches, going on
 =====================================================
 
 One recipe, one process or many. First what each process is given, then the same training by one process and by two,

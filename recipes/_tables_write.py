@@ -20,7 +20,7 @@ TITLES = {
     "comparison-animals": "Table 1, animals (paper: SMAL)",
     "norms": "Table 2, conditional normalisation, humans",
     "ablation": "Table 3, parts of X-DualNet, humans",
-    "humans-6890": "Humans at 6890 vertices, the first {large_pairs} pairs; trained at 1000 vertices, one seed",
+    "humans-6890": "Humans at 6890 vertices, bare networks, {large_pairs} pairs; trained at 1000 vertices, one seed",
 }
 
 SHEETS = {
