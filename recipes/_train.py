@@ -64,14 +64,14 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
         fabric, cfg = connect(cfg)
         torch.manual_seed(cfg.seed)
         generator, system = build(cfg)
+        if cfg.init is not None and state is None:  # before the descriptors, which take longer
+            initialize(generator, cfg.init)
         with fabric.rank_zero_first():
             train_pairs, test_pairs = data(cfg, run, torch.get_num_threads(), fabric.device)
     except (ValueError, RuntimeError) as error:
         raise UserError(str(error)) from None
     pool = getattr(train_pairs, "pool", None)
-    if cfg.init is not None and state is None:
-        initialize(generator, cfg.init)
-    elif pool is not None:
+    if pool is not None and cfg.init is None:
         cast(Any, generator).fit_descriptors(pool.descriptors)
     fused = fabric.device.type in ("cuda", "cpu")
     optimizer = torch.optim.Adam(generator.parameters(), lr=cfg.lr, betas=cfg.betas, eps=cfg.adam_eps, fused=fused)

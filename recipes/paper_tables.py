@@ -90,6 +90,11 @@ def figures(job_name: str, kind: str, vertices: int | None, count: int, cfg: Con
     return found
 
 
+def pmd_of(job: Job, cfg: Config) -> list[float]:
+    """PMD of each test pair, of a run."""
+    return figures(job.name, job.data, None, cfg.eval_pairs, cfg)["pmd"]
+
+
 def row(title: str, names: list[str], kind: str, cfg: Config, vertices: int | None = None, paper: Any = ()) -> Row:
     """A row of a table: mean and spread over runs of the means over pairs."""
     count = cfg.eval_pairs if vertices is None else cfg.large_pairs
@@ -203,8 +208,7 @@ def main() -> None:
             extra[name.partition("-")[0]] = kept(cfg.out / "figures" / f"{name}.json", make)
     found, drawn = tables(cfg, done), list[str]()
     if cfg.sheets:
-        errors = lambda job: figures(job.name, job.data, None, cfg.eval_pairs, cfg)["pmd"]  # noqa: E731
-        drawn = draw_sheets(to, done, extra["noise"], errors, cfg)
+        drawn = draw_sheets(to, done, extra["noise"], lambda job: pmd_of(job, cfg), cfg)
     write_tables(to, found, extra, PAPER_SECONDS, cfg, (wanted, done), drawn)
     print(f"tables and sheets: {to}")
     if failures:

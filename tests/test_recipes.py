@@ -378,3 +378,4 @@ def test_init_begins_with_the_weights_of_a_run(run: Callable[..., Path], without
     other = ("npt", "--name", "third", "--steps", 1, "--init", known, "--model.extractor-widths", 4, 4, 6)
     with pytest.raises(recipe_module("_run").UserError, match=r"--init .*run: .*corenet3d-humans"):
         run(*other)
+    assert not (tmp_path / "third").exists(), "refused before anything is computed"
