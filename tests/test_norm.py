@@ -503,6 +503,75 @@ def test_a_norm_without_modulation_says_so():
         ConditionalNorm(2, 2)(torch.ones(1, 3, 2), torch.ones(1, 3, 2))
 
 
+def of_linear(linear, std):
+    """A per-vertex modulation as a norm of one's own gives it, to be spoiled."""
+    weight = linear.weight.mT.expand(len(std), -1, -1)
+    return Modulation(
+        torch.zeros_like(std), 1 / std, linear.bias, features=None, scale_weight=weight, shift_weight=weight
+    )
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda m, cond: m._replace(features=cond, scale_weight=m.scale_weight[0]),
+            r"scale_weight .* x \(2, 5, 3\) must be \(2, 4, 3\), of each sample the transposed weight .* got \(4, 3\)",
+        ),
+        (
+            lambda m, cond: m._replace(features=cond, shift_weight=m.shift_weight.mT),
+            r"shift_weight .* must be \(2, 4, 3\).* got \(2, 3, 4\)",
+        ),
+        (lambda m, cond: m._replace(features=cond[:, :4]), r"features .* must be \(2, 5, 4\), got \(2, 4, 4\)"),
+        (lambda m, cond: m, "come together: features left out"),
+        (
+            lambda m, cond: Modulation(m.mean, m.scale_bias, m.shift_bias, features=cond),
+            "scale_weight and shift_weight left out",
+        ),
+        (
+            lambda m, cond: Modulation(m.mean, torch.ones(2, 5, 3), m.shift_bias),
+            r"scale_bias .* \(2, 1, 3\) or broadcast to it, got \(2, 5, 3\); what differs .* goes through features",
+        ),
+        (lambda m, cond: Modulation(m.mean, m.scale_bias, torch.ones(2, 3)), r"shift_bias .* got \(2, 3\)$"),
+        (lambda m, cond: Modulation(torch.ones(2, 1, 4), m.scale_bias, m.shift_bias), r"mean .* got \(2, 1, 4\)$"),
+        (lambda m, cond: (m.scale_bias, m.shift_bias), "must return a Modulation, got tuple"),
+    ],
+)
+@pytest.mark.parametrize("block", [False, True])
+def test_a_modulation_of_other_shapes_is_named(spoil, message, block):
+    class Own(ConditionalNorm):
+        def __init__(self, num_features, cond_features):
+            super().__init__(num_features, cond_features)
+            self.map = torch.nn.Linear(cond_features, num_features)
+
+        def modulation(self, cond, mean, std, *, cond_mask=None):
+            return spoil(of_linear(self.map, std), cond)
+
+    module = ConditionalResBlock(3, 4, norm=Own) if block else Own(3, 4)
+    with pytest.raises(ValueError, match=message):
+        module(torch.randn(2, 5, 3), torch.randn(2, 5, 4))
+
+
+def test_what_broadcasts_to_scale_and_shift_is_taken():
+    x, mean, vector = rand(2, 5, 3), rand(2, 1, 3, seed=1), rand(3, seed=2)
+    expected = vector * (x - mean) + vector
+    for bias in (vector, vector[None], vector[None, None]):
+        assert_near(modulate(x, Modulation(mean, bias, bias)), expected, 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("norm", "said"),
+    [
+        (SPAdaIN(3, 4, eps=1e-3), "SPAdaIN(3, 4, eps=0.001"),
+        (ElaIN(3, 4, variant="paper", gate="sigmoid"), "ElaIN(3, 4, eps=1e-05, variant='paper', gate='sigmoid'"),
+        (SoftAdaIN(3, 4, gate=None), "SoftAdaIN(3, 4, eps=1e-05, gate=None"),
+        (SPADE(3, 4, momentum=0.2), "SPADE(3, 4, eps=1e-05, momentum=0.2"),
+    ],
+)
+def test_a_printed_norm_shows_its_options(norm, said):
+    assert "".join(repr(norm).split()).startswith(said.replace(" ", ""))
+
+
 # Modulation
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.batching import masked_mean
 from meshkit.norm.base import ConditionalNorm, check_gate
 from meshkit.norm.modulation import Modulation
@@ -194,6 +195,10 @@ class SoftAdaIN(AdaIN):
         check_gate(gate)
         self.gate = gate
         self.weight = nn.Linear(2 * num_features, num_features)
+
+    def extra_repr(self) -> str:
+        """Widths and options in the printed module."""
+        return f"{super().extra_repr()}, {settings(self, 'gate')}"
 
     def modulation(self, cond: Tensor, mean: Tensor, std: Tensor, *, cond_mask: Tensor | None = None) -> Modulation:
         """The blended statistics."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.batching import check_mask
 from meshkit.norm.modulation import Modulation, modulate
 from meshkit.norm.statistics import instance_statistics, zero_padding
@@ -91,6 +92,10 @@ class ConditionalNorm(nn.Module):
         """Whether :meth:`statistics` of ``other`` are the same for the same ``x``, so that they are needed once."""
         own = (type(norm).statistics is ConditionalNorm.statistics for norm in (self, other))
         return all(own) and (self.unbiased, self.eps) == (other.unbiased, other.eps)
+
+    def extra_repr(self) -> str:
+        """Widths and options in the printed module."""
+        return f"{self.num_features}, {self.cond_features}, {settings(self, 'eps')}"
 
     def modulation(self, cond: Tensor, mean: Tensor, std: Tensor, *, cond_mask: Tensor | None = None) -> Modulation:
         """Scale and shift for a condition whose padded rows are zero, given the statistics of ``x``."""

@@ -21,8 +21,8 @@ class Modulation(NamedTuple):
 
     Args:
         mean: :math:`\mu` ``(B, 1, C)``, in the precision the statistics were taken in.
-        scale_bias: :math:`m_s` ``(B, 1, C)``: one per sample and channel, the same at all vertices. What differs from
-            vertex to vertex goes through ``features``.
+        scale_bias: :math:`m_s` ``(B, 1, C)`` or broadcast to it: one per sample and channel, the same at all vertices.
+            What differs from vertex to vertex goes through ``features``.
         shift_bias: :math:`m_t` ``(B, 1, C)``, likewise.
         features: f ``(B, N, D)``, or None where scale and shift are the same at all vertices.
         scale_weight: :math:`M_s` ``(B, D, C)``, or None beside ``features=None``.
@@ -64,7 +64,7 @@ def modulate(
         of a linear map then has; otherwise the result has the dtype of ``x``.
 
     Raises:
-        ValueError: a bias without a weight, or a negative slope.
+        ValueError: a bias without a weight, a negative slope, or a modulation that does not fit ``x``.
 
     Example:
         >>> x = torch.tensor([[[1.0], [3.0]]])
@@ -77,6 +77,7 @@ def modulate(
         raise ValueError("bias needs a weight: fold it into the shift instead")
     if slope is not None and slope < 0:
         raise ValueError(f"slope must not be negative, got {slope}")
+    check_modulation(x, modulation)
     device = x.device.type
     autocast = torch.is_autocast_enabled(device)
     dtype = torch.get_autocast_dtype(device) if autocast and x.dtype != torch.float64 else x.dtype
@@ -87,6 +88,36 @@ def modulate(
     inputs: tuple[Any, ...] = (x, mean, scale_bias, shift_bias, *cast, slope)
     with torch.autocast(device, enabled=False):
         return _formula(*inputs) if traced() else _Modulate.apply(*inputs)
+
+
+def check_modulation(x: Tensor, modulation: Modulation) -> None:
+    """Name what does not fit ``x (B, N, C)``; shapes alone are looked at, so nothing waits for a device."""
+    if not isinstance(modulation, Modulation):
+        raise ValueError(f"a norm's modulation must return a Modulation, got {type(modulation).__name__}")
+    batch, rows, channels = x.shape
+    for name in ("mean", "scale_bias", "shift_bias"):
+        shape = getattr(modulation, name).shape
+        wanted = (batch, 1, channels)
+        if len(shape) > 3 or any(n not in (1, m) for n, m in zip(shape[::-1], wanted[::-1], strict=False)):
+            hint = "; what differs from vertex to vertex goes through features" if shape[-2:-1] == (rows,) else ""
+            raise ValueError(
+                f"{name} of the modulation of x {tuple(x.shape)} must be {wanted} or broadcast to it, got "
+                f"{tuple(shape)}{hint}"
+            )
+    factors = {name: getattr(modulation, name) for name in ("features", "scale_weight", "shift_weight")}
+    missing = [name for name, value in factors.items() if value is None]
+    if len(missing) == 3:
+        return
+    if missing:
+        raise ValueError(f"features, scale_weight and shift_weight come together: {' and '.join(missing)} left out")
+    width = factors["features"].shape[-1:]
+    for name, value in factors.items():
+        wanted = (batch, rows, *width) if name == "features" else (batch, *width, channels)
+        if value.shape != wanted:
+            of = "" if name == "features" else ", of each sample the transposed weight of a linear map"
+            raise ValueError(
+                f"{name} of the modulation of x {tuple(x.shape)} must be {wanted}{of}, got {tuple(value.shape)}"
+            )
 
 
 def compose(outer: nn.Linear, inner: nn.Linear) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.norm.base import ConditionalNorm
 from meshkit.norm.modulation import Modulation
 
@@ -105,6 +106,10 @@ class SPADE(ConditionalNorm):
         self.register_buffer("running_mean", torch.zeros(num_features))
         self.register_buffer("running_var", torch.ones(num_features))
         self.register_buffer("num_batches_tracked", torch.tensor(0))
+
+    def extra_repr(self) -> str:
+        """Widths and options in the printed module."""
+        return f"{super().extra_repr()}, {settings(self, 'momentum')}"
 
     def statistics(self, x: Tensor, *, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Mean and deviation of the batch in training, running ones in evaluation."""
