@@ -33,11 +33,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.importorskip(needed)
     folder = tmp_path_factory.mktemp("site")
     source = folder / "source"
-    built = shutil.ignore_patterns("_build", "auto_examples", "api", "sg_execution_times.rst")
-    shutil.copytree(DOCS, source / "docs", ignore=built)
-    shutil.copytree(ROOT / "examples", source / "examples")
-    for name in ("meshkit", "recipes", "tests", "benchmarks", "README.md", "CITATION.cff"):
-        (source / name).symlink_to(ROOT / name)
+    built = shutil.ignore_patterns("_build", "auto_examples", "api", "sg_execution_times.rst", "__pycache__")
+    # Copies, not links: those need a privilege on Windows.
+    for name in ("docs", "examples", "meshkit", "recipes", "tests", "benchmarks"):
+        shutil.copytree(ROOT / name, source / name, ignore=built)
+    for name in ("README.md", "CITATION.cff"):
+        shutil.copy(ROOT / name, source)
     html = folder / "html"
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-D", "plot_gallery=0"]
     command += ["-d", str(folder / "doctrees"), str(source / "docs"), str(html)]
