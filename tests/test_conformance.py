@@ -6,6 +6,7 @@ row per vertex. The checks then know how to pad, permute, cast and compile it.
 
 import copy
 import importlib
+import inspect
 import io
 import pickle
 from collections.abc import Callable, Sequence
@@ -370,6 +371,23 @@ def test_every_public_module_has_an_entry():
 
 
 # Checks
+
+# Options that the printed parts show: classes, numbers of modules, widths of linear maps. Tables are buffers.
+SHOWN_BY_PARTS = {"norm", "spectral", "extractor", "extractor_blocks", "blocks", "hidden", "card"}
+SHOWN_BY_PARTS |= {"pose_correctives", "identities", "poses"}
+
+
+@CASES
+def test_a_printed_module_shows_its_options(name):
+    module = ENTRIES[name].build()
+    options = {
+        option.name
+        for option in inspect.signature(type(module).__init__).parameters.values()
+        if option.kind is option.KEYWORD_ONLY and isinstance(option.default, bool | int | float | str | None)
+    }
+    if name == "PoseTransferGenerator-pointwise":
+        options -= {"k"}  # without effect
+    assert {option for option in options - SHOWN_BY_PARTS if f"{option}=" not in repr(module)} == set()
 
 
 @CASES

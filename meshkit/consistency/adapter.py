@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
+from meshkit._repr import settings
+
 __all__ = ["AdaptedOutput", "GeneratorAdapter"]
 
 KEYWORDS = ("identity", "pose", "identity_mask", "pose_mask", "identity_descriptors", "pose_descriptors")
@@ -69,6 +71,10 @@ class GeneratorAdapter(nn.Module):
         self.generator = generator
         self.vertices, self.warped, self.plan = vertices, warped, plan
         self.channels_first = channels_first
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "keywords", "vertices", "warped", "plan", "channels_first")
 
     def forward(
         self,

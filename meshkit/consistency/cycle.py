@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.batching import check_verts
 from meshkit.consistency._passes import Mesh, check_stop_gradient, generate
 
@@ -82,6 +83,10 @@ class CycleReconstruction(nn.Module):
         super().__init__()
         check_stop_gradient(stop_gradient, get_args(StopGradient))
         self.generator, self.stop_gradient = generator, stop_gradient
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "stop_gradient")
 
     def forward(
         self,

@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.batching import check_verts
 from meshkit.consistency._passes import Mesh, check_stop_gradient, generate
 
@@ -100,6 +101,10 @@ class DualReconstruction(nn.Module):
             raise ValueError("points needs a generator with an encode method: features must come from whole meshes")
         self.generator, self.deform = generator, deform
         self.points, self.stop_gradient = points, stop_gradient
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "points", "stop_gradient")
 
     def forward(
         self,

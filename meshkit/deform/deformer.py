@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from meshkit._compile import uncompiled
+from meshkit._repr import settings
 from meshkit.deform.batched_deform import BatchedProblem
 from meshkit.deform.options import ARAPInfo, Options, check_options
 from meshkit.deform.problem import Problem
@@ -162,11 +163,8 @@ class ARAPDeformer(nn.Module):
 
     def extra_repr(self) -> str:
         """Options in the printed form of the module."""
-        options = self.options
-        return (
-            f"fraction={self.fraction}, energy={self.energy!r}, method={options.method!r}, "
-            f"max_iter={options.max_iter}, tol={options.tol}, grad={options.grad!r}"
-        )
+        choices = ", ".join(f"{name}={value!r}" for name, value in vars(self.options).items())
+        return f"{settings(self, 'fraction', 'energy', 'degenerate', 'generator')}, {choices}"
 
 
 def random_handles(problem: Problem, fraction: float, generator: torch.Generator | None) -> list[Tensor]:

@@ -6,6 +6,7 @@ from typing import Any, Literal, Protocol, get_args
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
 
@@ -317,6 +318,10 @@ class BackwardCorrespondenceLoss(nn.Module):
         self.form = form
         self.normalization = normalization
         self.reduction = reduction
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "form", "normalization", "reduction")
 
     def forward(
         self,

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from meshkit._numerics import safe_sqrt
+from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
 from meshkit.neighbors import gather_vertices, knn
@@ -125,6 +126,10 @@ class ChamferLoss(nn.Module):
         self.squared = squared
         self.direction: Direction = direction
         self.reduction: Reduction = reduction
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "squared", "direction", "reduction")
 
     def forward(
         self, pred: Tensor, target: Tensor, *, mask: Tensor | None = None, target_mask: Tensor | None = None

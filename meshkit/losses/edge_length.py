@@ -2,6 +2,7 @@
 
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
 from meshkit.losses._connectivity import connectivity, edge_lengths
@@ -73,6 +74,10 @@ class EdgeLengthLoss(nn.Module):
         super().__init__()
         check_reduction(reduction)
         self.reduction = reduction
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "reduction")
 
     def forward(self, verts: Tensor, faces: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Return the loss, see :func:`edge_length_loss`."""

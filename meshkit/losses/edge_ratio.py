@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from meshkit._numerics import launch_bound, safe_sqrt
+from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, check_reduction, check_same_shape, reduce_samples
 from meshkit.losses._connectivity import check_batch_faces, connectivity, edge_lengths
@@ -139,6 +140,10 @@ class EdgeRatioLoss(nn.Module):
         _check_min_length(min_length)
         self.min_length = min_length
         self.reduction = reduction
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "min_length", "reduction")
 
     def forward(self, verts: Tensor, reference: Tensor, faces: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Return the loss, see :func:`edge_ratio_loss`."""

@@ -5,6 +5,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, check_same_shape, reduce_samples
 from meshkit.losses._connectivity import Connectivity, connectivity
@@ -139,6 +140,10 @@ class LaplacianLoss(nn.Module):
         _check_weights(weights)
         self.weights: Weights = weights
         self.reduction: Reduction = reduction
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "weights", "reduction")
 
     def forward(
         self, verts: Tensor, faces: Tensor, *, reference: Tensor | None = None, mask: Tensor | None = None

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
 from meshkit.losses._connectivity import connectivity
@@ -87,6 +88,10 @@ class NormalConsistencyLoss(nn.Module):
         super().__init__()
         check_reduction(reduction)
         self.reduction: Reduction = reduction
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "reduction")
 
     def forward(self, verts: Tensor, faces: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Return the loss, see :func:`normal_consistency_loss`."""

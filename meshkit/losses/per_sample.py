@@ -4,6 +4,7 @@ from typing import Literal, get_args
 
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.deform import arap_energy
 from meshkit.ot import sinkhorn_divergence
 
@@ -59,6 +60,10 @@ class SinkhornDivergenceLoss(nn.Module):
         self.eps, self.n_iters, self.tol, self.anneal, self.debias = eps, n_iters, tol, anneal, debias
         self.reduction: SampleReduction = reduction
 
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "eps", "n_iters", "tol", "anneal", "debias", "reduction")
+
     def forward(
         self, pred: Tensor, target: Tensor, *, mask: Tensor | None = None, target_mask: Tensor | None = None
     ) -> Tensor:
@@ -99,6 +104,10 @@ class ARAPEnergyLoss(nn.Module):
         _check_reduction(reduction)
         self.energy = energy
         self.reduction: SampleReduction = reduction
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "energy", "reduction")
 
     def forward(self, verts: Tensor, reference: Tensor, faces: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Return the energy of ``verts (B, N, 3)`` against ``reference``, the rest shape; a scalar or ``(B,)``."""

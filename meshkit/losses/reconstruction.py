@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, check_same_shape, reduce_samples
 
@@ -76,6 +77,10 @@ class ReconstructionLoss(nn.Module):
         super().__init__()
         check_reduction(reduction)
         self.reduction = reduction
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "reduction")
 
     def forward(self, pred: Tensor, target: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Return the loss, see :func:`reconstruction_loss`."""

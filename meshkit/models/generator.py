@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
+from meshkit._repr import settings
 from meshkit.batching import masked_mean
 from meshkit.deform import rigid_moving_least_squares
 from meshkit.models._released_matching import STABILIZER, DensePlan, stabilized_matching
@@ -154,6 +155,11 @@ class PoseTransferGenerator(nn.Module):
         # At gain 1 the first outputs are metres away from any body and hundreds of steps go into bringing them back.
         nn.init.normal_(self.transfer.narrow[-1].get_parameter("weight"), std=1e-3)
         nn.init.zeros_(self.transfer.narrow[-1].get_parameter("bias"))
+
+    def extra_repr(self) -> str:
+        """Options in the printed module; sizes are those of its parts."""
+        matching = settings(self, "eps", "n_iters", "normalize_plan", "released")
+        return f"{matching}, {settings(self, 'condition', 'rigid_radius', 'match_size', 'symmetry')}"
 
     @torch.no_grad()
     def fit_descriptors(self, descriptors: Tensor) -> None:

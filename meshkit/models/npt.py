@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
+from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.models.output import GeneratorOutput
 from meshkit.nn import ConditionalResBlock
@@ -65,6 +66,10 @@ class NPT(nn.Module):
         self.encoder = _PoseEncoder(encoder_widths)
         self.decoder = _Decoder(encoder_widths[-1], bare_start=variant == "maxpool")
         self.reset_parameters()
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "variant")
 
     def reset_parameters(self) -> None:
         """Xavier initialisation, with a last layer small enough that training starts from a mesh near the centre."""

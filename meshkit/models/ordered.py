@@ -57,6 +57,10 @@ class OrderedPoseTransferStack(PoseTransferStack):
         self.add_warped = residual
         self.lift = nn.Linear(9, widths[0])  # columns: previous, own, next
 
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return f"residual={self.add_warped}"
+
     def forward(self, warped: Tensor, features: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Generate vertices from the warped mesh under the identity's features."""
         result = super().forward(_window(warped, mask), features, mask=mask)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, normalize
 
+from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.norm import instance_norm
 
@@ -57,6 +58,10 @@ class PointwiseExtractor(nn.Module):
         self.descriptors, self.out_features, self.slope = descriptors, widths[-1], slope
         self.linears = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise([3 + descriptors, *widths]))
         self.blocks = nn.ModuleList(_ResidualBlock(widths[-1]) for _ in range(blocks))
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "descriptors", "slope")
 
     def forward(self, positions: Tensor, *, descriptors: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Features of each vertex."""

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.nn import ConditionalResBlock
 from meshkit.norm import ElaIN
 
@@ -52,6 +53,10 @@ class PoseTransferStack(nn.Module):
         self.mix = nn.Linear(widths[0], widths[0])
         self.blocks = nn.ModuleList(ConditionalResBlock(w, cond_features, norm=norm, spectral=spectral) for w in widths)
         self.narrow = nn.ModuleList(nn.Linear(i, o) for i, o in zip(widths, [*widths[1:], 3], strict=True))
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "residual")
 
     def forward(self, warped: Tensor, features: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Generate vertices from the warped mesh under the identity's features."""

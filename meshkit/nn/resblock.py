@@ -11,6 +11,7 @@ from torch.nn.functional import leaky_relu, linear
 from torch.nn.utils.parametrizations import spectral_norm
 from torch.nn.utils.parametrize import is_parametrized
 
+from meshkit._repr import settings
 from meshkit.nn.spectral import settle_spectral_norm
 from meshkit.norm import ConditionalNorm, ElaIN, modulate
 
@@ -75,6 +76,10 @@ class ConditionalResBlock(nn.Module):
         self.conv_1 = wrap(nn.Linear(num_features, num_features))
         self.conv_s = wrap(nn.Linear(num_features, num_features, bias=False))
         settle_spectral_norm(self)
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "slope")
 
     def reset_parameters(self) -> None:
         """Draw the three linear maps anew, Xavier normal, and settle their spectral normalisation."""

@@ -9,6 +9,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.neighbors import gather_vertices, knn
 from meshkit.nn._edge_mlp import EPS, edge_mlp
 from meshkit.scatter import segment_sum
@@ -63,6 +64,10 @@ class SetConv(nn.Module):
         self.linears = nn.ModuleList(nn.Linear(i, o, bias=False) for i, o in pairwise(widths))
         self.scales = nn.ParameterList(nn.Parameter(torch.ones(out_features)) for _ in self.linears)
         self.shifts = nn.ParameterList(nn.Parameter(torch.zeros(out_features)) for _ in self.linears)
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return f"{self.in_features}, {self.out_features}, {settings(self, 'slope', 'recompute')}"
 
     def forward(
         self, x: Tensor, positions: Tensor, neighbors: Tensor | Neighborhoods, *, mask: Tensor | None = None
@@ -174,6 +179,10 @@ class SetConvExtractor(nn.Module):
         self.k, self.descriptors, self.out_features = k, descriptors, widths[-1]
         inputs = [3 + descriptors, *widths[:-1]]
         self.convs = nn.ModuleList(SetConv(i, o, recompute=recompute) for i, o in zip(inputs, widths, strict=True))
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "k", "descriptors")
 
     def forward(self, positions: Tensor, *, descriptors: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Features of each vertex."""

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from meshkit._repr import settings
 from meshkit.ot.options import Cost, Domain, Eps, Grad, Reach, Store, check_choice, read_options
 from meshkit.ot.plan import TransportPlan
 from meshkit.ot.sinkhorn import sinkhorn
@@ -110,7 +111,9 @@ class SinkhornCorrespondence(nn.Module):
 
     def extra_repr(self) -> str:
         """Options in the printed module."""
-        return f"cost={self.cost!r}, eps={self._eps}, n_iters={self.n_iters}, grad={self.grad!r}"
+        learned = "" if self.log_eps is None else f", learn_eps=True, {settings(self, 'min_eps')}"
+        rest = settings(self, "cost", "n_iters", "tol", "reach", "grad", "domain", "store")
+        return f"eps={self._eps}{learned}, {rest}"
 
 
 class CorrespondenceWarp(nn.Module):
@@ -140,6 +143,10 @@ class CorrespondenceWarp(nn.Module):
         super().__init__()
         self.correspondence = SinkhornCorrespondence() if correspondence is None else correspondence
         self.normalize = normalize
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "normalize")
 
     def forward(
         self,
