@@ -159,10 +159,11 @@ def test_components_import_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_public_names_exist() -> None:
+def test_every_public_module_lists_names_that_exist() -> None:
     for name in public_modules():
         module = importlib.import_module(name)
-        listed = getattr(module, "__all__", ())
+        assert "__all__" in vars(module), f"{name} does not say what of it is public: give it an __all__"
+        listed = module.__all__
         assert [n for n in listed if not hasattr(module, n)] == []
         assert len(set(listed)) == len(listed), f"{name}.__all__ repeats a name"
 

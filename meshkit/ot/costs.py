@@ -10,6 +10,8 @@ from torch import Tensor
 from meshkit.ot.kernel import refuse_second_derivative
 from meshkit.ot.tiles import LOG2_E
 
+__all__: list[str] = []  # internal: meshkit.ot lists what is public
+
 
 def logit_features(
     x: Tensor, y: Tensor, cost: str, eps: float | Tensor, *, constant: bool

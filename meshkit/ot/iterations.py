@@ -21,6 +21,8 @@ from torch import Tensor
 from meshkit.ot.kernel import GibbsKernel, Ledger, full_precision, refuse_second_derivative
 from meshkit.ot.tiles import Factors, Reference, Tiles
 
+__all__: list[str] = []  # internal: meshkit.ot lists what is public
+
 
 class Settings(NamedTuple):
     """How to iterate, and through what to differentiate.

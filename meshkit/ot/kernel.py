@@ -16,6 +16,8 @@ from torch import Tensor
 
 from meshkit.ot.tiles import Factors, Reference, Tiles
 
+__all__: list[str] = []  # internal: meshkit.ot lists what is public
+
 NO_SECOND_DERIVATIVE = (
     "sinkhorn has no second derivatives: its gradient is computed without a graph of its own. Leave out create_graph, "
     "or differentiate a dense plan written with torch operations"

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from meshkit.batching import check_mask
 
+__all__: list[str] = []  # internal: meshkit.ot lists what is public
+
 
 class Sides(NamedTuple):
     """Rows and columns of one sample that have weight; indices are ``None`` if all have."""

@@ -12,6 +12,8 @@ from torch import Tensor
 from meshkit.ot.iterations import Settings
 from meshkit.ot.marginals import Sides
 
+__all__: list[str] = []  # internal: meshkit.ot lists what is public
+
 Cost = Literal["cosine", "sqeuclidean", "dot"]
 Grad = Literal["unroll", "implicit", "last_step", "none"]
 Domain = Literal["auto", "kernel", "log"]

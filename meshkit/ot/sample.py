@@ -10,6 +10,8 @@ from torch import Tensor
 from meshkit.ot.kernel import GibbsKernel
 from meshkit.ot.tiles import LOG2_E, Reference
 
+__all__: list[str] = []  # internal: meshkit.ot lists what is public
+
 
 @dataclass
 class SamplePlan:

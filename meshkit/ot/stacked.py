@@ -22,6 +22,8 @@ from meshkit.ot.options import Options
 from meshkit.ot.sample import SamplePlan
 from meshkit.ot.tiles import LOG2_E, Factors, FeatureTiles, Reference, Tiles
 
+__all__: list[str] = []  # internal: meshkit.ot lists what is public
+
 STACK_BYTES = 1 << 27
 """Kernels up to this size, all samples together, are stored by ``store="auto"``."""
 

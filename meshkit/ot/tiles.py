@@ -21,6 +21,8 @@ from torch import Tensor
 
 from meshkit.ot.workspace import borrow
 
+__all__: list[str] = []  # internal: meshkit.ot lists what is public
+
 LOG2_E = 1 / math.log(2)
 _BLOCK_BYTES = 7 << 20
 _RANGE = 36.0
