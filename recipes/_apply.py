@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 import sys
 from pathlib import Path
 
 import torch
+from _data import told
 from _run import UserError
 from torch import Tensor
 
@@ -13,6 +16,12 @@ from meshkit.batching import bounding_box_center, center
 from meshkit.descriptors import intrinsic_descriptors
 from meshkit.io import MeshFileError, load_mesh, save_mesh
 from meshkit.models import GeneratorConfig, load_generator
+from meshkit.models.pretrained import check_extent
+
+IN_METRES = ("humans", "animals", "smpl", "smal", "faust")
+"""Kinds of --data whose bodies are in metres; meshes of other folders may be in any unit."""
+SELDOM_LONGEST = {"humans": "y", "smpl": "y", "animals": "xz", "smal": "xz"}
+"""Axes along which the bodies of a kind are longest in few poses; a person's arms may reach farther than it is tall."""
 
 
 @torch.no_grad()
@@ -20,23 +29,22 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
     """Give the first mesh file the pose of the second, with the weights of the run in ``folder``."""
     try:
         generator, model = load_generator(folder)
+        kind = trained_on(folder)
         meshes = [load_mesh(path) for path in files]
         for path, (verts, _) in zip(files, meshes, strict=True):
-            if model.architecture == "matching" and len(verts) < model.k:
+            if kind in IN_METRES:
+                other = shlex.join(["meshkit-transfer", *map(str, files), "--weights", str(folder)])
+                check_extent(float(extent(verts).max()), str(path), advice=f"`{other}` guesses unit and axes")
+            if model.architecture == "matching" and model.extractor == "setconv" and len(verts) < model.k:
                 raise UserError(f"{path}: {len(verts)} vertices; this model looks at {model.k} neighbours")
         descriptors: list[Tensor] | list[None] = [None, None]
         if model.descriptors == "wks":
             descriptors = [describe(path, *mesh, model) for path, mesh in zip(files, meshes, strict=True)]
         for path, (verts, _) in zip(files, meshes, strict=True):
-            warn(path, verts)
+            warn(path, verts, kind)
         (identity, faces), (pose, _) = meshes
-        output = generator(
-            center(identity[None]),
-            center(pose[None]),
-            identity_descriptors=descriptors[0],
-            pose_descriptors=descriptors[1],
-            **({"identity_faces": faces} if getattr(generator, "symmetry", False) else {}),
-        )
+        known = {"identity_descriptors": descriptors[0], "pose_descriptors": descriptors[1], "identity_faces": faces}
+        output = generator(center(identity[None]), center(pose[None]), **told(generator, known))
         # Training meshes are centred; the result goes to where the pose mesh stands.
         save_mesh(result, output.vertices[0] + bounding_box_center(pose[None])[0], faces)
     except (MeshFileError, ValueError) as error:
@@ -46,17 +54,29 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
     print(f"{result}: {len(identity)} vertices of {files[0]} in the pose of {files[1]}")
 
 
-def warn(path: Path, verts: Tensor) -> None:
+def trained_on(folder: Path) -> str:
+    """The word before the colon of the run's --data; empty if that is not known."""
+    try:
+        return str(json.loads((folder / "config.json").read_text())["data"]).partition(":")[0]
+    except (KeyError, OSError, TypeError, ValueError):
+        return ""
+
+
+def extent(verts: Tensor) -> Tensor:
+    return verts.amax(0) - verts.amin(0)
+
+
+def warn(path: Path, verts: Tensor, kind: str) -> None:
     """Speak up where a mesh is unlike the bodies a model was trained on."""
-    extent = verts.amax(0) - verts.amin(0)
-    tallest = float(extent.max())
-    if not 0.5 <= tallest <= 2.6:
+    tallest = float(extent(verts).max())
+    axis = "xyz"[int(extent(verts).argmax())]
+    if kind in IN_METRES and not 0.5 <= tallest <= 2.6:
         print(
             f"warning: {path} is {tallest:.3g} long; weights trained on bodies in metres expect about 1 to 2",
             file=sys.stderr,
         )
-    if int(extent.argmax()) == 1:
-        print(f"warning: {path} is longest along y; expected z up, facing -y", file=sys.stderr)
+    if axis in SELDOM_LONGEST.get(kind, ""):
+        print(f"warning: {path} is longest along {axis}; expected z up, facing -y", file=sys.stderr)
 
 
 def describe(path: Path, verts: Tensor, faces: Tensor, model: GeneratorConfig) -> Tensor:

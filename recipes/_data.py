@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from _run import Run, UserError
-from torch import Tensor
+from torch import Tensor, nn
 
 from meshkit.data import (
     RELEASED_SPLITS,
@@ -27,6 +28,8 @@ from meshkit.data import (
     scan_mgn,
     scan_pose_transfer,
 )
+from meshkit.io import MeshFileError
+from meshkit.models import NPT
 
 KINDS = "humans, animals, smpl:<file>, smal:<file>, faust:<folder>, mgn:<folder> or folder:<folder>"
 SCANNERS = {"faust": scan_faust, "mgn": scan_mgn, "folder": scan_pose_transfer}
@@ -58,6 +61,20 @@ def inputs(batch: PairBatch) -> dict[str, Tensor | None]:
         "identity_descriptors": batch.identity_descriptors,
         "pose_descriptors": batch.pose_descriptors,
     }
+
+
+def told(generator: nn.Module, known: Mapping[str, Tensor | None]) -> dict[str, Tensor | None]:
+    """Of what is known beside the vertices, that which a generator takes in evaluation.
+
+    NPT takes no descriptors, which a pool may have computed for others; what resolves exchanged limbs takes the
+    identity's faces.
+    """
+    names = ["identity_mask", "pose_mask"]
+    if not isinstance(generator, NPT):
+        names += ["identity_descriptors", "pose_descriptors"]
+    if getattr(generator, "symmetry", False):
+        names.append("identity_faces")
+    return {name: known.get(name) for name in names}
 
 
 def rigged(kind: str, file: Path) -> tuple[RiggedModel, Split]:
@@ -106,7 +123,14 @@ def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, Mesh
         if len(chosen) < 2:
             raise UserError(f"--data {cfg.data}: {len(chosen)} meshes to {side} on are too few, of {len(entries)}")
         # Every process reads the cache; who comes first has made it.
-        stores.append(MeshStore.build(chosen, run.path(f"cache_{side}"), progress=run.writes))
+        where = run.path(f"cache_{side}")
+        try:
+            stores.append(MeshStore.build(chosen, where, skip_bad=cfg.skip_bad, progress=run.writes))
+        except MeshFileError as error:
+            advice = "" if cfg.skip_bad else "; mend or remove the file, or leave out such files with --skip-bad"
+            raise UserError(f"--data {cfg.data}: {error}{advice}") from None
+        if len(stores[-1]) < 2:
+            raise UserError(f"--data {cfg.data}: {len(stores[-1])} readable meshes to {side} on are too few")
     common: dict[str, Any] = {"seed": cfg.seed}
     if run.writes:
         tell(stores, cfg.eval_pairs)

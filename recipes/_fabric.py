@@ -5,20 +5,23 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from datetime import timedelta
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 from _machine import pick_precision, world_size
 from _run import UserError
 from _settings import Settings
-from lightning_fabric import Fabric
-from lightning_fabric.strategies.ddp import DDPStrategy
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
 
 S = TypeVar("S", bound=Settings)
 
 
 def connect(cfg: S) -> tuple[Fabric, S]:
     """Fabric with its processes started, and the configuration with the precision that was picked."""
+    from lightning_fabric import Fabric  # slow: --help, --apply and most refusals do without
+
     if cfg.precision == "auto":
         cfg = replace(cfg, precision=pick_precision(Fabric(accelerator=cfg.accelerator, **shape(cfg)).device))
     fabric = Fabric(accelerator=cfg.accelerator, precision=cast(Any, cfg.precision), **shape(cfg))
@@ -42,6 +45,8 @@ def shape(cfg: Settings) -> dict[str, Any]:
     """Number and kind of the processes."""
     if world_size(cfg.devices) == 1:
         return {"devices": 1}
+    from lightning_fabric.strategies.ddp import DDPStrategy
+
     # The other processes wait while the first computes descriptors and figures.
     strategy = DDPStrategy(timeout=timedelta(hours=6))
     if "LOCAL_WORLD_SIZE" not in os.environ:  # not torchrun: Fabric starts the other processes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from _data import Pairs, inputs
+from _data import Pairs, inputs, told
 from _run import Run
 from torch import Tensor, nn
 
@@ -13,7 +13,6 @@ from meshkit.batching import center
 from meshkit.data import PairBatch, PosePairs
 from meshkit.io import save_mesh
 from meshkit.metrics import chamfer_distance, correspondence_error, pmd
-from meshkit.models import NPT
 from meshkit.viz import contact_sheet, error_colors, plot_curves, render
 
 
@@ -47,12 +46,8 @@ def generate(generator: nn.Module, batch: PairBatch, place: int) -> Any:
     """The generator's result; one that is told more than the meshes takes the batch and its place among the pairs."""
     if getattr(generator, "takes_batches", False):
         return generator(batch, place)
-    # With both hands of the identity to match, a generator wants to know what hangs together.
-    faces = {"identity_faces": batch.identity_faces} if getattr(generator, "symmetry", False) else {}
-    told = inputs(batch)
-    if isinstance(generator, NPT):  # it takes no descriptors, which a pool may have computed for others
-        told = {"identity_mask": told["identity_mask"], "pose_mask": told["pose_mask"]}
-    return generator(batch.identity, batch.pose, **told, **faces)
+    known = inputs(batch) | {"identity_faces": batch.identity_faces}
+    return generator(batch.identity, batch.pose, **told(generator, known))
 
 
 def report(run: Run, generator: nn.Module, pairs: Pairs, device: torch.device, facts: dict[str, Any]) -> None:

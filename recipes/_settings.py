@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -39,6 +41,8 @@ class Settings:
     data: str = "humans"
     """What to train on: humans or animals, which ship with meshkit; smpl:<file> or smal:<file>, a licensed model;
     faust:<folder>, mgn:<folder>, or folder:<folder> of meshes named {identity}_{pose}.obj."""
+    skip_bad: bool = False
+    """Leave out mesh files that cannot be read, with a warning, instead of ending at the first."""
     minutes: float | None = 8.0
     """Training time; turned into a number of steps once, by the measured speed, and recorded. Paper: 24 to 90 hours."""
     steps: int | None = None
@@ -103,9 +107,27 @@ S = TypeVar("S", bound=Settings)
 
 
 def parse(presets: dict[str, S], description: str | None) -> S:
-    """Read the command line against the chosen preset's values."""
-    words = " ".join(sys.argv[1:]).replace("--preset=", "--preset ").split()
-    chosen = words[words.index("--preset") + 1] if "--preset" in words[:-1] else "tiny"
+    """Read the command line against the chosen preset's values; of two presets the last counts."""
+    words = sys.argv[1:]
+    chosen = "tiny"
+    for word, value in zip(words, [*words[1:], ""], strict=True):
+        flag, joined, own = word.partition("=")
+        if flag == "--preset":
+            chosen = own if joined else value
     default = presets.get(chosen, presets["tiny"])
     kind: Any = type(default)
     return tyro.cli(kind, default=default, description=description)  # type: ignore[no-any-return]
+
+
+def typed(kind: type, words: Sequence[str]) -> list[str]:
+    """The settings that a command line names, ``model.`` before those of the generator.
+
+    As tyro reads them: ``--lr=1``, ``--eval_pairs 1``, ``--no-arap``, ``--model.no-residual``.
+    """
+    known = {f.name for f in fields(kind)} | {f"model.{f.name}" for f in fields(GeneratorConfig)}
+    found = []
+    for word in words:
+        if word.startswith("--"):
+            name = word[2:].partition("=")[0].replace("-", "_")
+            found += [n for n in (name, re.sub(r"^(model\.)?no_", r"\1", name)) if n in known][:1]
+    return list(dict.fromkeys(found))

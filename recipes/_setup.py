@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from operator import attrgetter
 from typing import Any
 
 from _machine import rank, world_size
 from _run import UserError
+from _settings import typed
 from torch import nn
 
 from meshkit.models import GeneratorConfig, load_generator, load_pretrained, pretrained_names
@@ -48,15 +49,8 @@ def check(cfg: Any) -> None:
 
 
 def given(cfg: Any) -> list[str]:
-    """The flags whose values are not those of the preset, ``model.`` before those of the generator."""
-    presets = getattr(sys.modules[type(cfg).__module__], "PRESETS", {})
-    if cfg.preset not in presets:
-        return []
-    usual = presets[cfg.preset]
-    names = [*(f.name for f in fields(cfg) if f.name != "model"), *(f"model.{f.name}" for f in fields(cfg.model))]
-    # A recipe may set the architecture itself. A preset differs from itself in nothing: the command line is asked.
-    differ = [name for name in names if name != "model.architecture" and value_of(cfg, name) != value_of(usual, name)]
-    return [*(["preset"] if any(word.startswith("--preset") for word in sys.argv[1:]) else []), *differ]
+    """The settings that were typed, ``model.`` before those of the generator."""
+    return typed(type(cfg), sys.argv[1:])
 
 
 def value_of(cfg: Any, flag: str) -> Any:
@@ -93,12 +87,82 @@ def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = Non
     return replace(begun, batch=batch, accumulate=pairs_per_step // (batch * processes))
 
 
-def initialize(generator: nn.Module, init: str) -> None:
-    """Give ``generator`` the weights called ``init``, with their statistics of descriptors."""
+SHAPING = {"architecture", "extractor", "extractor_widths", "extractor_blocks", "widths", "norm", "spectral"}
+SHAPING |= {"condition", "descriptors", "num_signatures", "released"}
+"""Settings that decide which parameters there are, and their shapes."""
+
+
+def initialize(generator: nn.Module, cfg: Any) -> None:
+    """Give ``generator`` the weights called ``cfg.init``, with their statistics of descriptors."""
+    names = pretrained_names()
     try:
-        known = load_pretrained(init).generator if init in pretrained_names() else load_generator(init)[0]
+        if cfg.init in names:
+            loaded = load_pretrained(cfg.init)
+            known, model = loaded.generator, loaded.config
+        else:
+            known, model = load_generator(cfg.init)
+    except ValueError as error:
+        advice = f"give one of {', '.join(names)}, or the folder of a run"
+        raise UserError(f"--init {cfg.init}: {str(error).splitlines()[0]}; {advice}") from None
+    others = differences(model, cfg.model)
+    try:
         generator.load_state_dict(known.state_dict())
-    except (RuntimeError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        advice = f"give one of {', '.join(pretrained_names())}, or the folder of a run with the same --model settings"
-        raise UserError(f"--init {init}: {reason}; {advice}") from None
+    except RuntimeError:
+        shaping = [name for name in others if name in SHAPING]
+        said = ", ".join(others[name] for name in shaping) or "another version's parameters"
+        raise UserError(f"--init {cfg.init} has another network: {said}; {advise(cfg, model, shaping)}") from None
+    others.pop("symmetry", None)  # of evaluation alone
+    if others and rank() == 0:
+        said = ", ".join(others.values())
+        print(f"warning: --init {cfg.init} was trained with other --model settings: {said}", file=sys.stderr)
+
+
+def differences(theirs: GeneratorConfig, ours: GeneratorConfig) -> dict[str, str]:
+    """Settings that count in both and differ, in words."""
+    a, b = effective(theirs), effective(ours)
+    if a["architecture"] != b["architecture"]:
+        a, b = ({"architecture": values["architecture"]} for values in (a, b))
+    return {
+        name: f"{name.replace('_', '-')} {in_words(a[name])} (here {in_words(b[name])})"
+        for name in a
+        if name in b and a[name] != b[name]
+    }
+
+
+def effective(model: GeneratorConfig) -> dict[str, Any]:
+    """The settings that count beside each other, with what ``auto`` stands for."""
+    values = asdict(model)
+    if model.architecture != "matching":
+        return {name: values[name] for name in ("architecture", "extractor_widths")}
+    if model.condition == "auto":
+        values["condition"] = "features" if model.descriptors == "none" else "descriptors"
+    if model.descriptors == "none":
+        del values["num_signatures"], values["match_size"]
+    del values["extractor_blocks" if model.extractor == "setconv" else "k"]
+    return values
+
+
+def in_words(value: Any) -> str:
+    """As the command line writes it."""
+    return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def advise(cfg: Any, model: GeneratorConfig, shaping: list[str]) -> str:
+    """What to type for a network that takes the weights of ``model``."""
+    presets = getattr(sys.modules[type(cfg).__module__], "PRESETS", {})
+    fitting = [name for name, preset in presets.items() if not SHAPING & set(differences(model, preset.model))]
+    asked = [flag for flag in given(cfg) if flag.removeprefix("model.") in shaping]
+    without = "leave out " + ", ".join(f"--{flag.replace('_', '-')}" for flag in asked) if asked else ""
+    if fitting and cfg.preset not in fitting:
+        return f"add --preset {fitting[0]}" + (f" and {without}" if without else "")
+    if fitting and asked:
+        return without
+    if not shaping or "architecture" in shaping:
+        return "give weights of the same network"
+    values = effective(model)
+    return "add " + " ".join(flag_of(name, values[name]) for name in shaping)
+
+
+def flag_of(name: str, value: Any) -> str:
+    name = name.replace("_", "-")
+    return f"--model.{'' if value else 'no-'}{name}" if isinstance(value, bool) else f"--model.{name} {in_words(value)}"

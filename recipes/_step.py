@@ -7,16 +7,18 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from _graph import GraphedStep
 from _run import UserError
 from _settings import Settings
-from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from meshkit.data import PairBatch
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
 
 Step = Callable[[nn.Module, PairBatch, Any, float], dict[str, Tensor]]
 

@@ -65,7 +65,7 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
         torch.manual_seed(cfg.seed)
         generator, system = build(cfg)
         if cfg.init is not None and state is None:  # before the descriptors, which take longer
-            initialize(generator, cfg.init)
+            initialize(generator, cfg)
         with fabric.rank_zero_first():
             train_pairs, test_pairs = data(cfg, run, torch.get_num_threads(), fabric.device)
     except (ValueError, RuntimeError) as error:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import ModuleType
@@ -403,22 +404,51 @@ def test_bad_meshes_are_named(
     assert not result.exists()
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [(lambda v: 100 * v, "is 1"), (lambda v: v[:, [0, 2, 1]], "longest along y")],
-    ids=["cm", "y up"],
-)
-def test_meshes_in_other_units_or_axes_are_spoken_of(whole: Path, files: Path, tmp_path: Path, change, said) -> None:
+@pytest.fixture
+def odd(files: Path, tmp_path: Path) -> Callable[[Any], Path]:
+    """A pose mesh 1.7 m tall, changed."""
     verts, faces = load_mesh(files / "pose.ply")
     verts = verts * (1.7 / (verts.amax(0) - verts.amin(0))[2])
-    save_mesh(tmp_path / "odd.obj", change(verts), faces)
-    run = launch(
-        "xdualnet",
-        *("--out", whole.parent, "--name", whole.name, "--result", tmp_path / "posed.obj"),
-        *("--apply", files / "identity.obj", tmp_path / "odd.obj"),
-    )
-    assert run.returncode == 0
-    assert any("odd.obj" in line and said in line for line in run.stderr.splitlines() if line.startswith("warning: "))
+
+    def odd(change: Any) -> Path:
+        save_mesh(tmp_path / "odd.obj", change(verts), faces)
+        return tmp_path / "odd.obj"
+
+    return odd
+
+
+@pytest.mark.parametrize("scale", [100, 1000, 1 / 1000], ids=["cm", "mm", "km"])
+def test_meshes_that_cannot_be_metres_are_refused(
+    whole: Path, files: Path, refuse: Any, odd: Any, scale: float
+) -> None:
+    result = files / "never.obj"
+    pair = (files / "identity.obj", odd(lambda v: scale * v))
+    line = refuse("--out", whole.parent, "--name", whole.name, "--apply", *pair, "--result", result)
+    assert f"odd.obj is {1.7 * scale:.3g} long, but these weights take meshes of about 1 to 2 (metres" in line
+    assert f"meshkit-transfer {pair[0]} {pair[1]} --weights {whole}`" in line
+    assert not result.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "data", "said"),
+    [
+        (lambda v: 2 * v, "humans", "is 3.4 long"),
+        (lambda v: v[:, [0, 2, 1]], "humans", "longest along y"),
+        (lambda v: v, "animals", "longest along z"),
+        (lambda v: v[:, [0, 2, 1]], "animals", None),
+        (lambda v: 100 * v, "folder:meshes", None),
+    ],
+    ids=["large", "y up", "upright animal", "animal", "a unit of one's own"],
+)
+def test_what_is_merely_unusual_is_spoken_of(
+    recipe: ModuleType, copied: Path, files: Path, odd: Any, capsys: pytest.CaptureFixture[str], change, data, said
+) -> None:
+    config = read_json(copied / "config.json") | {"data": data}
+    (copied / "config.json").write_text(json.dumps(config))
+    recipe.apply(copied, (files / "identity.obj", odd(change)), copied / "posed.obj")
+    lines = [line for line in capsys.readouterr().err.splitlines() if "odd.obj" in line]
+    assert len(lines) == (0 if said is None else 1)
+    assert all(line.startswith("warning: ") and said in line for line in lines)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -13,7 +14,7 @@ from typing import Any
 
 import pytest
 import torch
-from recipe_runs import read_json, read_log, recipe_module
+from recipe_runs import ROOT, read_json, read_log, recipe_module
 
 from meshkit.data import PairBatch, PosePairs, human_split, load_humans
 from meshkit.io import save_mesh
@@ -376,6 +377,107 @@ def test_init_begins_with_the_weights_of_a_run(run: Callable[..., Path], without
     parameters = [name for name, _ in load_generator(known)[0].named_parameters()]
     assert parameters and all(torch.equal(before[name], after[name]) for name in parameters)
     other = ("npt", "--name", "third", "--steps", 1, "--init", known, "--model.extractor-widths", 4, 4, 6)
-    with pytest.raises(recipe_module("_run").UserError, match=r"--init .*run: .*corenet3d-humans"):
+    said = r"run has another network: extractor-widths 4 4 5 \(here 4 4 6\); add --model.extractor-widths 4 4 5$"
+    with pytest.raises(recipe_module("_run").UserError, match=said):
         run(*other)
     assert not (tmp_path / "third").exists(), "refused before anything is computed"
+
+
+@pytest.mark.parametrize(
+    ("recipe", "init", "flags", "said"),
+    [
+        (
+            "xdualnet",
+            "xdualnet-humans",
+            (),
+            "xdualnet-humans has another network: extractor-widths 32 64 64 (here 16 32 32); add --preset small",
+        ),
+        (
+            "corenet3d",
+            "corenet3d-humans",
+            ("--model.widths", 8, "--lr", 1),
+            "extractor-widths 32 64 64 (here 16 32 32), widths 256 128 64 (here 8); add --preset small and leave out "
+            "--model.widths",
+        ),
+        ("corenet3d", "corenet3d-humans", ("--preset=small", "--norm", "spadain"), "(here spadain); leave out --norm"),
+        (
+            "xdualnet",
+            "xdualnet-humans",
+            ("--preset", "small", "--model.no-spectral"),
+            "spectral True (here False); leave out --model.spectral",
+        ),
+        ("npt", "corenet3d-humans", (), "architecture matching (here npt_maxpool); give weights of the same network"),
+        ("xdualnet", "nobody", (), "nobody holds no model.json: give the folder of a finished or checkpointed run"),
+    ],
+)
+def test_weights_of_another_network_say_what_to_type(run: Any, recipe: str, init: str, flags: Any, said: str) -> None:
+    with pytest.raises(recipe_module("_run").UserError) as refused:
+        run(recipe, "--steps", 1, "--init", init, *flags)
+    assert said in str(refused.value)
+
+
+def test_other_settings_that_fit_are_spoken_of(capsys: pytest.CaptureFixture[str]) -> None:
+    recipe, setup = recipe_module("corenet3d"), recipe_module("_setup")
+    cfg = replace(recipe.PRESETS["small"], init="corenet3d-humans")
+    setup.initialize(recipe.build(cfg)[0], cfg)
+    assert capsys.readouterr().err == ""
+    cfg = replace(cfg, model=replace(cfg.model, k=8, symmetry=True))
+    setup.initialize(recipe.build(cfg)[0], cfg)
+    assert capsys.readouterr().err.endswith("trained with other --model settings: k 16 (here 8)\n")
+
+
+def test_flags_are_read_as_they_are_typed(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings, recipe = recipe_module("_settings"), recipe_module("xdualnet")
+    words = "--no-arap --lambda_edge=3 --model.no-residual --model.extractor_widths 4 4 --eval-pairs 2 --lr -1"
+    words = ["--preset", "small", *words.split(), "--preset=tiny", "--nonsense", "batch"]
+    expected = [
+        "preset",
+        "arap",
+        "lambda_edge",
+        "model.residual",
+        "model.extractor_widths",
+        "eval_pairs",
+        "lr",
+    ]
+    assert settings.typed(recipe.Config, words) == expected
+    monkeypatch.setattr(sys, "argv", ["xdualnet.py", "--preset", "small", "--preset=tiny"])
+    assert settings.parse(recipe.PRESETS, None) == recipe.PRESETS["tiny"], "of two presets the last counts, whole"
+
+
+def test_a_generator_is_told_what_it_takes(batch: PairBatch) -> None:
+    data = recipe_module("_data")
+    known = data.inputs(batch) | {"identity_faces": batch.identity_faces}
+    matching = GeneratorConfig(extractor_widths=(4, 4), widths=(4,), k=2)
+    takes = {
+        name: set(data.told(config.build(), known))
+        for name, config in {
+            "npt": GeneratorConfig(architecture="npt_maxpool", extractor_widths=(4, 5)),
+            "plain": matching,
+            "symmetric": replace(matching, symmetry=True),
+        }.items()
+    }
+    masks, descriptors = {"identity_mask", "pose_mask"}, {"identity_descriptors", "pose_descriptors"}
+    assert takes["npt"] == masks
+    assert takes["plain"] == masks | descriptors
+    assert takes["symmetric"] == masks | descriptors | {"identity_faces"}
+
+
+@pytest.mark.usefixtures("without_report")
+def test_damaged_files_are_named_or_left_out(run: Any, tmp_path: Path) -> None:
+    place = body_files(tmp_path / "meshes", range(5), range(5))
+    damaged = place / "1_1.ply"
+    damaged.write_text("not a mesh")
+    words = ("corenet3d", "--data", f"folder:{place}", *FAST)
+    with pytest.raises(recipe_module("_run").UserError, match=rf"{damaged.name}.*; mend or remove .* --skip-bad$"):
+        run(*words)
+    with pytest.warns(UserWarning, match=r"1 of 9 mesh files were left out, the first: .*1_1.ply"):
+        folder = run(*words, "--skip-bad")
+    assert (folder / "model.safetensors").exists()
+
+
+def test_help_does_without_what_trains() -> None:
+    """Fabric, and what it imports of torch, take seconds."""
+    code = "import sys; sys.argv = ['xdualnet.py', '--help']; sys.path.insert(0, 'recipes'); import xdualnet\n"
+    code += "print({'lightning_fabric', 'torch._dynamo', 'matplotlib'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "set()"), done.stderr

@@ -125,11 +125,8 @@ class PretrainedTransfer(nn.Module):
         verts = (verts if verts.dim() == 3 else verts[None]).to(next(self.generator.parameters()).dtype)
         real = verts.detach() if mask is None else verts.detach()[mask]
         extent = float((real.flatten(0, -2).amax(0) - real.flatten(0, -2).amin(0)).amax()) if real.numel() else 0.0
-        if self.card and not _SMALLEST < extent < _LARGEST:
-            raise ValueError(
-                f"{name} is {extent:.3g} long, but these weights take meshes of about 1 to 2 (metres, z up, facing "
-                "-y): meshkit.transfer.transfer_pose brings others there"
-            )
+        if self.card:
+            check_extent(extent, name, advice="meshkit.transfer.transfer_pose brings others there")
         k = self.config.k if self.config.architecture == "matching" and self.config.extractor == "setconv" else 1
         if verts.shape[1] < k:
             raise ValueError(f"{name} has {verts.shape[1]} vertices; these weights look at {k} neighbours of each")
@@ -142,6 +139,15 @@ class PretrainedTransfer(nn.Module):
             sides[f"{name}_descriptors"] = descriptors
             sides[f"{name}_features"] = self.generator.encode(centred, mask=mask, descriptors=descriptors)
         return sides
+
+
+def check_extent(extent: float, name: str, *, advice: str) -> None:
+    """Refuse a mesh whose longest side cannot be metres; ``advice`` says what can be done with it."""
+    if not _SMALLEST < extent < _LARGEST:
+        raise ValueError(
+            f"{name} is {extent:.3g} long, but these weights take meshes of about 1 to 2 (metres, z up, facing -y): "
+            f"{advice}"
+        )
 
 
 def _repeated(value: Tensor, batch: int) -> Tensor:
