@@ -129,6 +129,14 @@ def exporter():
     del sys.path[:2]
 
 
+@pytest.mark.parametrize("name", pretrained_names())
+def test_a_shipped_card_is_the_one_its_facts_give(exporter, name):
+    folder = ROOT / "meshkit" / "weights"
+    text = exporter.markdown(name, json.loads((folder / f"{name}.json").read_text()))
+    assert text == (folder / f"{name}.md").read_text()
+    assert ("set convolutions" in text) == name.startswith("corenet3d")
+
+
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory):
     """The files of a finished run, of a network that was never trained."""

@@ -169,6 +169,16 @@ def differences(preset: dict[str, Any], config: dict[str, Any], prefix: str) -> 
     return words
 
 
+def network(card: dict[str, Any]) -> str:
+    """What the name of the system does not say of its network, as a line of the card."""
+    if card["system"].startswith("3D-CoreNet") and card["model"]["extractor"] == "setconv":
+        return (
+            "- **Network**: with X-DualNet's extractor of set convolutions, as the recipe's; the published one, that\n"
+            "  of `meshkit.models.corenet3d()`, is pointwise.\n"
+        )
+    return ""
+
+
 def markdown(name: str, card: dict[str, Any]) -> str:
     figures = card["figures"]
     rows = "\n".join(f"| {key} | {value} |" for key, value in figures.items())
@@ -193,7 +203,7 @@ posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces
 
 - **Input**: two meshes, z up, facing -y, around {card["vertices"]} vertices each, in {unit};
   `meshkit.transfer` brings others there.
-- **Training**: `{card["command"]}`
+{network(card)}- **Training**: `{card["command"]}`
   ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor}, {card["precision"]}, torch
   {machine["torch"]}), finished on {card["date"]}.
 - **Split**: {card["split"]}
