@@ -6,6 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -30,9 +31,15 @@ from meshkit.models import corenet3d, load_generator, load_pretrained, npt, xdua
 METRICS = {"pmd": 1e3, "cd": 1e3, "emd": 1e2, "match": 1e2}  # as the paper prints them; correspondence in hundredths
 
 
+# Read once, for all rows and sheets.
+pretrained = cache(load_pretrained)
+shipped = cache(load_shipped)
+
+
+@cache
 def test_pairs(kind: str, vertices: int | None, count: int, out: Path) -> PosePairs:
     """The first ``count`` fixed test pairs, with their descriptors, which are computed once and kept in ``out``."""
-    body, split = load_shipped(kind, vertices)
+    body, split = shipped(kind, vertices)
     listed = split.test_pairs[:count]
     file = out / f"descriptors-{kind}-{len(body.template)}-{count}.safetensors"
     if not file.exists():
@@ -80,6 +87,7 @@ def fingerprint(name: str, out: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()[:8] if file.exists() else "none"
 
 
+@cache
 def generator_of(name: str, out: Path) -> nn.Module:
     """The generator of a run, or of shipped weights.
 
@@ -91,7 +99,7 @@ def generator_of(name: str, out: Path) -> nn.Module:
             return load_generator(out / name)[0]
         except ValueError as error:
             raise UserError(str(error)) from None
-    return load_pretrained(name).generator
+    return pretrained(name).generator
 
 
 def copies(pairs: PosePairs, emd_pairs: int) -> dict[str, list[float]]:

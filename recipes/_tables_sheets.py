@@ -8,15 +8,13 @@ from typing import Any
 
 import torch
 from _report import generate
-from _tables_measure import generator_of, test_pairs
+from _tables_measure import generator_of, pretrained, shipped, test_pairs
 from _tables_train import SYSTEMS, Job
 from torch import Tensor
 
 from meshkit.batching import center
-from meshkit.data import load_humans, load_shipped
 from meshkit.io import atomic_write, simplify
 from meshkit.metrics import pmd
-from meshkit.models import load_pretrained
 from meshkit.viz import contact_sheet, correspondence_figure, plot_curves, render
 
 NOISE = (0.0, 5.0, 10.0, 20.0)  # millimetres
@@ -63,10 +61,10 @@ def transfer_sheet(path: Path, kind: str, columns: dict[str, str], rows: Iterabl
 @torch.no_grad()
 def noise_curve(count: int = 40) -> dict[str, list[float]]:
     """Mean PMD (e-3) of the shipped weights over ``count`` test pairs whose pose meshes are noisy."""
-    body, split = load_shipped("humans", 1000)
+    body, split = shipped("humans", 1000)
     curve: dict[str, list[float]] = {"sigma_mm": list(NOISE)}
     for name in WEIGHTS:
-        net = load_pretrained(name)
+        net = pretrained(name)
         curve[name] = []
         for sigma in NOISE:
             errors = [noisy(net, body, split.test_pairs[i], sigma)[3] for i in range(count)]
@@ -87,9 +85,9 @@ def noisy(net: Any, body: Any, pair: Tensor, sigma: float) -> tuple[Tensor, Tens
 @torch.no_grad()
 def topology_errors(count: int = 20) -> dict[str, Any]:
     """Mean PMD (e-3) of the shipped weights on bodies of other triangulations, all pairs of their sizes."""
-    _, split = load_shipped("humans", 1000)
-    bodies = {size: load_humans(size) for size in SIZES}
-    nets = [load_pretrained(name) for name in WEIGHTS]
+    _, split = shipped("humans", 1000)
+    bodies = {size: shipped("humans", size)[0] for size in SIZES}
+    nets = [pretrained(name) for name in WEIGHTS]
     table: dict[str, list[float]] = {}
     for first, one in bodies.items():
         for second, two in bodies.items():
@@ -106,18 +104,18 @@ def topology_errors(count: int = 20) -> dict[str, Any]:
 @torch.no_grad()
 def topology_sheet(path: Path) -> None:
     """One pose on bodies of different triangulations, and on a coarse one of none of the shipped topologies."""
-    _, split = load_shipped("humans", 1000)
-    net, grid = load_pretrained(WEIGHTS[0]), []
+    _, split = shipped("humans", 1000)
+    net, grid = pretrained(WEIGHTS[0]), []
     for a, p, b, q in split.test_pairs[2:5, :, None]:
-        two = load_humans(3445)
+        two = shipped("humans", 3445)[0]
         pose = (two(b, q)[0], two.faces)
         shown = [pose]
         for size in (1000, 2000):
-            one = load_humans(size)
+            one = shipped("humans", size)[0]
             identity = one(a, p)[0]
             shown += [(identity, one.faces)]
             shown += [(net(identity, pose[0], identity_faces=one.faces, pose_faces=two.faces), one.faces)]
-        fine = load_humans(6890)
+        fine = shipped("humans", 6890)[0]
         coarse = simplify(fine(a, p)[0], fine.faces, 700)
         shown += [(coarse.verts, coarse.faces)]
         output = net(coarse.verts, pose[0], identity_faces=coarse.faces, pose_faces=two.faces)
@@ -147,8 +145,8 @@ def correspondence_sheet(path: Path, cfg: Any) -> None:
 @torch.no_grad()
 def noise_sheet(path: Path) -> None:
     """A pose mesh with more and more noise, and what becomes of the result."""
-    body, split = load_shipped("humans", 1000)
-    net, grid, captions = load_pretrained(WEIGHTS[0]), [], []
+    body, split = shipped("humans", 1000)
+    net, grid, captions = pretrained(WEIGHTS[0]), [], []
     for i in (1, 4):
         found = [noisy(net, body, split.test_pairs[i], sigma) for sigma in NOISE]
         meshes = [(found[0][0], body.faces)] + [(m, body.faces) for f in found for m in (f[1], f[2])]

@@ -208,11 +208,15 @@ def test_sheets_are_drawn_of_what_there_is(config: Any, monkeypatch: pytest.Monk
     monkeypatch.setattr(sheets, "NOISE", (0.0, 5.0))
     for name in ("topology_sheet", "noise_sheet"):  # pictures of the shipped weights: seconds each, tried below
         monkeypatch.setattr(sheets, name, lambda path: path.write_bytes(b""))
+    measure, read = recipe_module("_tables_measure"), []
+    load_file = measure.load_file
+    monkeypatch.setattr(measure, "load_file", lambda file: read.append(file) or load_file(file))
     finished_run(tmp_path / "humans-npt-0", 0)
     noise = sheets.noise_curve(count=1)
     assert all(len(noise[name]) == 2 and min(noise[name]) > 0 for name in sheets.WEIGHTS)
     drawn = sheets.draw_sheets(tmp_path, [train.Job("humans", "npt", 0)], noise, lambda job: [1.0, 2.0, 3.0], config)
     assert drawn == ["comparison-humans", "topologies", "correspondence", "noise", "noise_curve"]
+    assert [file.name for file in read] == ["descriptors-humans-1000-3.safetensors"], "read once for all sheets"
     with Image.open(tmp_path / "comparison-humans.png") as picture:  # two of the four rows exist
         colors = picture.convert("RGB").getcolors(maxcolors=1 << 16)
     assert colors is not None and len(colors) > 40, "an empty sheet has white alone"
