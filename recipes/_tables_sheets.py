@@ -17,6 +17,7 @@ from meshkit.io import atomic_write, simplify
 from meshkit.metrics import pmd
 from meshkit.viz import contact_sheet, correspondence_figure, plot_curves, render
 
+NOISE_PAIRS, TOPOLOGY_PAIRS = 40, 20  # the first test pairs, that noise and triangulations are measured on
 NOISE = (0.0, 5.0, 10.0, 20.0)  # millimetres
 SIZES = (1000, 2000, 3445)
 WEIGHTS = ("corenet3d-humans", "xdualnet-humans")
@@ -59,7 +60,7 @@ def transfer_sheet(path: Path, kind: str, columns: dict[str, str], rows: Iterabl
 
 
 @torch.no_grad()
-def noise_curve(count: int = 40) -> dict[str, list[float]]:
+def noise_curve(count: int = NOISE_PAIRS) -> dict[str, list[float]]:
     """Mean PMD (e-3) of the shipped weights over ``count`` test pairs whose pose meshes are noisy."""
     body, split = shipped("humans", 1000)
     curve: dict[str, list[float]] = {"sigma_mm": list(NOISE)}
@@ -83,7 +84,7 @@ def noisy(net: Any, body: Any, pair: Tensor, sigma: float) -> tuple[Tensor, Tens
 
 
 @torch.no_grad()
-def topology_errors(count: int = 20) -> dict[str, Any]:
+def topology_errors(count: int = TOPOLOGY_PAIRS) -> dict[str, Any]:
     """Mean PMD (e-3) of the shipped weights on bodies of other triangulations, all pairs of their sizes."""
     _, split = shipped("humans", 1000)
     bodies = {size: shipped("humans", size)[0] for size in SIZES}

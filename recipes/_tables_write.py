@@ -5,16 +5,19 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from _tables_train import Job, command
+from _tables_sheets import NOISE_PAIRS, TOPOLOGY_PAIRS
+from _tables_train import Job, command, jobs
 
 from meshkit.io import atomic_write
 
+KINDS = {"humans": "SMPL", "animals": "SMAL"}  # and the paper's bodies of that kind
 HEADS = {"pmd": "PMD (e-3)", "cd": "CD (e-3)", "emd": "EMD (e-2)", "match": "match error (e-2)"}
+HEADS_OF_HUMANS = HEADS | {"match": "match error (cm)"}  # they are in metres
 TITLES = {
     "comparison-humans": "Table 1, humans (paper: SMPL)",
     "comparison-animals": "Table 1, animals (paper: SMAL)",
@@ -30,7 +33,7 @@ SHEETS = {
     "topologies": "Other triangulations, shipped weights",
     "correspondence": "Correspondence, shipped weights: lines of matches more than 10 cm off are red",
     "noise": "Noise on the pose mesh, shipped weights",
-    "noise_curve": "PMD against noise, shipped weights, 40 pairs",
+    "noise_curve": f"PMD against noise, shipped weights, first {NOISE_PAIRS} test pairs",
     "failures-humans": "The worst test pairs, humans",
     "failures-animals": "The worst test pairs, animals",
 }
@@ -54,12 +57,13 @@ def shown(figure: tuple[float, float] | None) -> str:
     return f"{mean:.2f}" if math.isnan(spread) else f"{mean:.2f} ± {spread:.2f}"
 
 
-def table(rows: list[Row]) -> str:
-    """Markdown; the paper's own figures in brackets."""
-    lines = ["| method | runs | " + " | ".join(HEADS.values()) + " |", "|---|---|" + "---|" * len(HEADS)]
+def table(rows: list[Row], heads: dict[str, str]) -> str:
+    """Markdown; the paper's own figures in brackets. A metric that no row has is left out."""
+    names = [name for name in heads if any(name in row.figures or name in row.paper for row in rows)]
+    lines = ["| method | runs | " + " | ".join(heads[name] for name in names) + " |", "|---|---|" + "---|" * len(names)]
     for row in rows:
         cells = [
-            shown(row.figures.get(name)) + (f" [{row.paper[name]:.2f}]" if name in row.paper else "") for name in HEADS
+            shown(row.figures.get(name)) + (f" [{row.paper[name]:.2f}]" if name in row.paper else "") for name in names
         ]
         lines.append(f"| {row.title} | {row.runs} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
@@ -72,42 +76,78 @@ def order(rows: list[Row]) -> str:
         return ""
     here = sorted(compared, key=lambda row: row.figures["pmd"][0])
     printed = sorted(compared, key=lambda row: row.paper["pmd"])
-    text = here[0].title
+    text, signs = here[0].title, set[str]()
     for first, second in pairwise(here):
         (a, spread_a), (b, spread_b) = first.figures["pmd"], second.figures["pmd"]
         error = math.hypot(spread_a / math.sqrt(first.runs), spread_b / math.sqrt(second.runs))
-        text += (" ? " if math.isnan(error) else " < " if b - a > 2 * error else " ~ ") + second.title
+        sign = "?" if math.isnan(error) else "<" if b - a > 2 * error else "~"
+        text += f" {sign} {second.title}"
+        signs.add(sign)
     paper = " < ".join(row.title for row in printed)
-    return (
-        f"PMD here: {text}. Paper: {paper}. `<`: by more than two standard errors of the difference of means; `~`: by "
-        "less; `?`: a single run, whose spread is not known.\n"
-    )
+    meanings = {
+        "<": "by more than two standard errors of the difference of means",
+        "~": "by less than two standard errors of the difference of means",
+        "?": "a single run, whose spread is not known",
+    }
+    legend = "; ".join(f"`{sign}`: {meaning}" for sign, meaning in meanings.items() if sign in signs)
+    return f"PMD here: {text}. Paper: {paper}. Here {legend}.\n"
 
 
-def plain(title: str, heads: list[str], rows: list[list[Any]]) -> str:
+def plain(title: str, said: str, heads: list[str], rows: list[list[Any]]) -> str:
     """A table of other things."""
-    lines = [f"## {title}", "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    lines = [
+        f"## {title}",
+        "",
+        *([said, ""] if said else []),
+        "| " + " | ".join(heads) + " |",
+        "|" + "---|" * len(heads),
+    ]
     return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)]) + "\n"
 
 
-def budget_text(cfg: Any, missing: list[Job]) -> str:
-    """What the figures are of."""
+def budget_text(tables: dict[str, list[Row]], cfg: Any, missing: list[Job]) -> str:
+    """What the figures are of; words are explained where they are used."""
     given = f"{cfg.pairs} training pairs" if cfg.minutes is None else f"{cfg.minutes} minutes"
-    text = (
+    kinds = [kind for kind in KINDS if f"comparison-{kind}" in tables]
+    sizes = {"humans": "humans with 1000 vertices", "animals": "animals with 1962"}
+    units = {"humans": "of humans in centimetres", "animals": "of animals in hundredths of their unit"}
+    sentences = [
         f"Every system is trained with {given} (batch {cfg.batch}, preset `{cfg.preset}`) and measured on the same "
         f"{cfg.eval_pairs} pairs of unseen identities in unseen poses (EMD: the first "
-        f"{min(cfg.emd_pairs, cfg.eval_pairs)}), humans with "
-        "1000 vertices, animals with 1962. `±` is the standard deviation over runs that differ in their seed. In "
-        "brackets: the paper's figures, on SMPL and SMAL, after 24 to 90 GPU hours; the data differ, so only the order "
-        "compares. Match error: distance between the matched and the true vertex, in the unit of the bodies.\n\n"
-        "What the presets make unequal: X-DualNet and the baseline resolve exchanged limbs in evaluation (`symmetry`), "
-        "3D-CoreNet does not need to; NPT takes no descriptors, as published.\n"
+        f"{min(cfg.emd_pairs, cfg.eval_pairs)}), {', '.join(sizes[kind] for kind in kinds)}.",
+    ]
+    if any(row.runs > 1 for rows in tables.values() for row in rows):
+        sentences.append("`±` is the standard deviation over runs that differ in their seed.")
+    if any(row.paper for rows in tables.values() for row in rows):
+        bodies = " and ".join(KINDS[kind] for kind in kinds)
+        sentences.append(
+            f"In brackets: the paper's figures, on {bodies}, after 24 to 90 GPU hours; the data differ, so only the "
+            "order compares."
+        )
+    if any("match" in row.figures for rows in tables.values() for row in rows):
+        where = ", ".join(units[kind] for kind in kinds)
+        sentences.append(f"Match error: distance between the matched and the true vertex, {where}.")
+    text = " ".join(sentences) + "\n"
+    text += (
+        "\nWhat the presets make unequal: X-DualNet and the baseline resolve exchanged limbs in evaluation "
+        "(`symmetry`), 3D-CoreNet does not need to; NPT takes no descriptors, as published.\n"
     )
     if missing:
         counts = Counter(f"{job.data} {job.system}" for job in missing)
         listed = ", ".join(f"{name} ({n})" for name, n in counts.items())
-        text += f"\nRuns still to be trained, and not in these tables: {listed}.\n"
+        why = "still to be trained" if set(KINDS) <= set(cfg.data) else "still to be trained or left out by `--data`"
+        text += f"\nRuns that are not in these tables, {why}: {listed}.\n"
     return text
+
+
+def tables_command(cfg: Any) -> str:
+    """The command that these tables are of, but for its folders."""
+    words = ["python recipes/paper_tables.py"]
+    for f in fields(cfg):
+        value = getattr(cfg, f.name)
+        if f.name not in ("train", "sheets", "out", "to") and value != f.default:
+            words.append(f"--{f.name.replace('_', '-')} {' '.join(value) if isinstance(value, tuple) else value}")
+    return " ".join(words)
 
 
 def write_csv(path: Path, rows: list[Row]) -> None:
@@ -125,20 +165,28 @@ def write_csv(path: Path, rows: list[Row]) -> None:
             writer.writerow([row.title, row.runs, *cells])
 
 
-def measured_once(extra: dict[str, Any], paper_seconds: dict[str, float]) -> list[str]:
+def measured_once(extra: dict[str, Any], paper_seconds: dict[str, float], made_by: str) -> list[str]:
     """Tables of what does not depend on the runs: times, and the shipped weights under noise and triangulations."""
     seconds, noise, sizes = extra["seconds"], extra["noise"], extra["topologies"]
-    times, where = seconds["seconds"], f"{seconds['processor']}, {seconds['threads']} thread(s)"
+    threads = f"{seconds['threads']} thread{'s' if seconds['threads'] > 1 else ''}"
+    times, where = seconds["seconds"], f"{seconds['processor']}, {threads}"
     timed = [[name, f"{s:.3f}", f"{s / times['NPT']:.1f}", paper_seconds[name]] for name, s in times.items()]
     curves = [[name, *(f"{v:.2f}" for v in noise[name])] for name in noise if name != "sigma_mm"]
     cells = [[place, *(f"{v:.2f}" for v in values)] for place, values in sizes["pmd"].items()]
     heads_of_times = ["method", f"s ({where})", "times NPT's", "paper, s (GPU)"]
     heads = ["noise of the pose mesh (mm)", *(f"{sigma:g}" for sigma in noise["sigma_mm"])]
     others = ["identity, pose vertices", *sizes["weights"]]
+    noisy = f"Noise: PMD (e-3) of shipped weights, humans, first {NOISE_PAIRS} test pairs"
+    triangulated = f"Triangulations: PMD (e-3) of shipped weights, humans, first {TOPOLOGY_PAIRS} test pairs"
     return [
-        plain("Table 5, time of a transfer at 6890 vertices, the papers' sizes", heads_of_times, timed),
-        plain("Noise: PMD (e-3) of shipped weights, humans", heads, curves),
-        plain("Triangulations: PMD (e-3) of shipped weights, humans", others, cells),
+        plain(
+            "Table 5, time of a transfer at 6890 vertices, the papers' sizes",
+            f"DT: deformation transfer. {made_by}",
+            heads_of_times,
+            timed,
+        ),
+        plain(noisy, f"Normal noise of that deviation on every coordinate. {made_by}", heads, curves),
+        plain(triangulated, f"Bodies of three triangulations, without simplification. {made_by}", others, cells),
     ]
 
 
@@ -148,18 +196,20 @@ def write_tables(
     extra: dict[str, Any],
     paper_seconds: dict[str, float],
     cfg: Any,
-    jobs: tuple[list[Job], list[Job]],
+    done: list[Job],
     drawn: list[str],
 ) -> None:
-    """tables.md, and a CSV file for each table; ``jobs`` are those wanted and those done, ``drawn`` the sheets."""
-    wanted, done = jobs
-    parts = ["# The paper's tables\n", budget_text(cfg, [job for job in wanted if job not in done])]
+    """tables.md, and a CSV file for each table; ``done`` are the runs they are of, ``drawn`` the sheets."""
+    made_by = tables_command(cfg)
+    missing = [job for job in jobs(tuple(KINDS), cfg.seeds) if job not in done]
+    parts = ["# The paper's tables\n", budget_text(tables, cfg, missing)]
     for name, rows in tables.items():
-        parts += [f"## {TITLES[name].format(large_pairs=cfg.large_pairs)}\n", table(rows), order(rows)]
+        heads = HEADS if name.endswith("animals") else HEADS_OF_HUMANS
+        parts += [f"## {TITLES[name].format(large_pairs=cfg.large_pairs)}\n", table(rows, heads), order(rows)]
         write_csv(to / f"{name}.csv", rows)
-    parts += measured_once(extra, paper_seconds) if extra else []
+    parts += measured_once(extra, paper_seconds, f"`{made_by}`") if extra else []
     parts += [f"## {title}\n\n![{title}]({name}.png)\n" for name, title in SHEETS.items() if name in drawn]
-    commands = "\n".join(f"python {' '.join(command(job, cfg))}" for job in done)
+    commands = "\n".join([made_by, *(f"python {' '.join(command(job, cfg))}" for job in done)])
     parts.append(f"## Commands\n\n```sh\n{commands}\n```\n")
     with atomic_write(to / "tables.md") as path:
         path.write_text("\n".join(part for part in parts if part), encoding="utf-8")

@@ -209,7 +209,7 @@ def main() -> None:
     found, drawn = tables(cfg, done), list[str]()
     if cfg.sheets:
         drawn = draw_sheets(to, done, extra["noise"], lambda job: pmd_of(job, cfg), cfg)
-    write_tables(to, found, extra, PAPER_SECONDS, cfg, (wanted, done), drawn)
+    write_tables(to, found, extra, PAPER_SECONDS, cfg, done, drawn)
     print(f"tables and sheets: {to}")
     if failures:
         raise UserError("; ".join(failures) + ". The tables are without them; the same command tries again")

@@ -128,8 +128,45 @@ def test_tables_hold_means_and_spreads_over_runs(tables: Callable[..., Path], tm
     assert float(npt["pmd paper"]) == 2.77
     assert float(rows["deformation transfer"]["pmd mean"]) < float(rows["copy the identity"]["pmd mean"])
     text = (folder / "tables.md").read_text()
-    assert "humans corenet3d (2)" in text, "runs that are missing are named"
+    assert "humans corenet3d (2)" in text and "animals npt (2)" in text, "runs that are missing are named"
     assert "recipes/npt.py" in text and "--seed 1" in text
+    assert "`±` is the standard deviation" in text
+    made_by = "python recipes/paper_tables.py --data humans --pairs 8 --seeds 2 --eval-pairs 3 --emd-pairs 2 "
+    assert f"{made_by}--large-pairs 0\n" in text, "the command of the tables themselves"
+
+
+def test_words_are_explained_where_they_are_used(config: Any) -> None:
+    write = recipe_module("_tables_write")
+
+    def row(metric: str, spread: float, runs: int) -> Any:
+        return write.Row("NPT", {"pmd": (1.0, spread), metric: (2.0, spread)}, runs, {"pmd": 3.0})
+
+    single = {"comparison-humans": [row("cd", math.nan, 1)]}
+    text = write.budget_text(single, config, [])
+    assert "on SMPL, after" in text
+    assert not any(word in text for word in ("±", "animals", "SMAL", "Match error", "Runs that"))
+    both = single | {"comparison-animals": [row("match", 0.1, 3)]}
+    text = write.budget_text(both, config, [])
+    for words in ("`±` is", "on SMPL and SMAL", "animals with 1962", "humans in centimetres, of animals in hundredths"):
+        assert words in text
+    assert write.table(both["comparison-animals"], write.HEADS).splitlines()[0] == (
+        "| method | runs | PMD (e-3) | match error (e-2) |"
+    )
+    assert "| match error (cm) |" in write.table(both["comparison-animals"], write.HEADS_OF_HUMANS)
+
+
+def test_what_is_measured_once_says_on_how_many_pairs_and_by_which_command() -> None:
+    write, sheets = recipe_module("_tables_write"), recipe_module("_tables_sheets")
+    extra = {
+        "seconds": {"seconds": {"NPT": 1.0}, "threads": 1, "processor": "P"},
+        "noise": {"sigma_mm": [0.0], "a": [1.0]},
+        "topologies": {"weights": ["a"], "pmd": {"1000, 1000": [1.0]}},
+    }
+    times, noise, triangulations = write.measured_once(extra, {"NPT": 0.5}, "`the command`")
+    assert f"first {sheets.NOISE_PAIRS} test pairs" in noise.splitlines()[0]
+    assert f"first {sheets.TOPOLOGY_PAIRS} test pairs" in triangulations.splitlines()[0]
+    assert all("`the command`" in part for part in (times, noise, triangulations))
+    assert "s (P, 1 thread)" in times
 
 
 def test_measurements_are_made_once(
@@ -200,7 +237,9 @@ def test_the_order_of_methods_says_where_spreads_overlap() -> None:
     rows = [row("a", 3.0, 0.1, 1.0), row("b", 2.0, 0.1, 2.0), row("c", 2.15, 0.1, 3.0)]
     assert write.order(rows).startswith("PMD here: b ~ c < a. Paper: a < b < c.")  # two standard errors are 0.163
     single = [replace(r, runs=1, figures={"pmd": (r.figures["pmd"][0], math.nan)}) for r in rows]
-    assert write.order(single).startswith("PMD here: b ? c ? a.")
+    said = write.order(single)
+    assert said.startswith("PMD here: b ? c ? a.")
+    assert "`?`: a single run" in said and "`<`" not in said and "`~`" not in said, "signs that are used are explained"
 
 
 def test_sheets_are_drawn_of_what_there_is(config: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
