@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from meshkit.data import (
     load_shipped,
     load_smal,
     load_smpl,
+    sample_identities,
     scan_faust,
     scan_mgn,
     scan_pose_transfer,
@@ -45,10 +47,14 @@ def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -
         raise UserError(f"--data {cfg.data}: there is no {place}")
     try:
         if kind in SCANNERS:
+            if cfg.sampled_identities:
+                raise UserError("--sampled-identities needs a rig, whose shapes have coefficients: drop it")
             return files(cfg, run, SCANNERS[kind](place))
         body, split = rigged(kind, Path(place)) if place else load_shipped(kind, cfg.vertices)
     except ValueError as error:
         raise UserError(f"--data {cfg.data}: {error}") from None
+    if cfg.sampled_identities:
+        body, split = with_sampled_identities(body, split, cfg.sampled_identities, cfg.seed)
     train, test = posed(cfg, run, workers, body, split)
     return train.to(device), test.to(device)
 
@@ -95,6 +101,19 @@ def rigged(kind: str, file: Path) -> tuple[RiggedModel, Split]:
     poses[:, 0] = 0.0
     body.poses = poses
     return body, drawn_split(len(body.identities), len(poses), draw)
+
+
+def with_sampled_identities(body: RiggedModel, split: Split, count: int, seed: int) -> tuple[RiggedModel, Split]:
+    """A body and split with ``count`` more training identities, like the known training ones."""
+    if body.identities is None:
+        raise UserError("this rig has no identities to draw others from")
+    draw = torch.Generator().manual_seed(seed)
+    known = body.identities
+    new = sample_identities(known[split.train_identities], count, spread=0.7, generator=draw)
+    body.identities = torch.cat([known, new])
+    body.identity_names = ()
+    train = torch.cat([split.train_identities, len(known) + torch.arange(count)])
+    return body, replace(split, train_identities=train)
 
 
 def drawn_split(identities: int, poses: int, draw: torch.Generator) -> Split:
@@ -173,6 +192,8 @@ def posed(cfg: Any, run: Run, workers: int, body: RiggedModel, split: Split) -> 
         }
         for side in pools:
             key = f"{side}, {cfg.data}, {len(body.template)} vertices, {cfg.model.num_signatures} signatures, "
+            if side == "train" and cfg.sampled_identities:
+                key += f"{cfg.sampled_identities} sampled identities, "
             key += f"pool {cfg.pool}, seed {cfg.seed}" if side == "train" else f"{len(listed)} pairs"
             stored = run.load_tensors(f"pool_{side}.safetensors", key)
             if stored is None:

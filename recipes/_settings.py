@@ -58,6 +58,9 @@ class Settings:
     vertices: int | None = None
     """Vertices per mesh, None for the smallest there are: humans have 1000, 2000, 3445 or 6890, animals 1962. Paper:
     6890 and 3889."""
+    sampled_identities: int = 0
+    """Further training identities, drawn from the Gaussian of the known ones; shipped and licensed rigs alone. Paper:
+    SMAL's animals are drawn so."""
     pool: int = 1200
     """Training meshes whose signatures are computed beforehand (with --model.descriptors wks)."""
     workers: int = 0

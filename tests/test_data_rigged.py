@@ -13,6 +13,7 @@ from meshkit.data import (
     RiggedModel,
     load_humans,
     rotation_matrices,
+    sample_identities,
 )
 
 
@@ -193,3 +194,23 @@ def test_forward_errors():
         bare(torch.tensor([0, 1]), pose)
     with pytest.raises(ValueError, match="no table of pose entries"):
         bare(betas, torch.tensor([0, 1]))
+
+
+def test_sampled_identities_have_the_mean_and_covariance_of_the_table():
+    torch.manual_seed(0)
+    table = torch.randn(12, 5, dtype=torch.float64) @ torch.randn(5, 5, dtype=torch.float64) + 3
+    drawn = sample_identities(table, 200_000, spread=0.5, generator=torch.Generator().manual_seed(1))
+    assert torch.allclose(drawn.mean(0), table.mean(0), atol=0.02)
+    assert torch.allclose(drawn.T.cov(), table.T.cov() / 4, atol=0.05)
+
+
+def test_sampled_shares_sum_to_one_and_stay_in_the_span_of_the_table():
+    shares = torch.eye(7)[:4]
+    drawn = sample_identities(shares, 20)
+    assert torch.allclose(drawn.sum(1), torch.ones(20), atol=1e-5)
+    assert bool((drawn[:, 4:] == 0).all())  # other bodies stay unseen
+
+
+def test_sampling_needs_two_identities():
+    with pytest.raises(ValueError, match=r"at least two rows.*\(1, 3\)"):
+        sample_identities(torch.randn(1, 3), 4)

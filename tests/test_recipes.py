@@ -16,7 +16,7 @@ import pytest
 import torch
 from recipe_runs import ROOT, read_json, read_log, recipe_module
 
-from meshkit.data import PairBatch, PosePairs, human_split, load_humans
+from meshkit.data import PairBatch, PosePairs, human_split, load_humans, load_shipped
 from meshkit.io import save_mesh
 from meshkit.models import GeneratorConfig, load_generator
 from meshkit.norm import SPAdaIN
@@ -243,6 +243,29 @@ def test_wrong_data_is_named(run: Any, word: str, said: str) -> None:
     with pytest.raises(recipe_module("_run").UserError) as caught:
         run("corenet3d", "--data", word, *FAST)
     assert any(part in str(caught.value) for part in said.split("|")), str(caught.value)
+
+
+def test_sampled_identities_join_the_training_ones_alone(run: Any, without_report: None) -> None:
+    more = ("--data", "animals", "--sampled-identities", 50, "--steps", 1, *SMALL_EXTRACTOR)
+    folder = run("corenet3d", *more, *WITHOUT_DESCRIPTORS)
+    assert read_json(folder / "config.json")["sampled_identities"] == 50
+    data = recipe_module("_data")
+    body, split = load_shipped("animals")
+    known = body.identities
+    body, wider = data.with_sampled_identities(body, split, 50, seed=0)
+    assert len(wider.train_identities) == len(split.train_identities) + 50
+    assert torch.equal(body.identities[: len(known)], known) and torch.equal(
+        wider.test_identities, split.test_identities
+    )
+    assert bool((body.identities[wider.train_identities][:, split.test_identities].abs() < 1e-6).all())
+    again = data.with_sampled_identities(load_shipped("animals")[0], split, 50, seed=0)[0]
+    assert torch.equal(again.identities, body.identities)
+
+
+def test_sampled_identities_need_a_rig(run: Any, tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    with pytest.raises(recipe_module("_run").UserError, match="--sampled-identities needs a rig"):
+        run("corenet3d", "--data", f"folder:{tmp_path / 'meshes'}", "--sampled-identities", 5, *WITHOUT_DESCRIPTORS)
 
 
 def test_files_and_signatures_do_not_go_together(run: Any, tmp_path: Path) -> None:

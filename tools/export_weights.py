@@ -238,6 +238,12 @@ with the body; limbs that touch. Left and right limbs that look alike are someti
 """
 
 
+def drawn(config: dict[str, Any]) -> str:
+    """What to say of identities that were drawn for the run."""
+    count = config.get("sampled_identities", 0)
+    return f", {count} more drawn from their Gaussian," if count else ""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of a finished run")
@@ -274,7 +280,8 @@ def main() -> None:
         "seed": config["seed"],
         "data": config["data"],
         "vertices": len(body.template),
-        "split": f"{len(split.train_identities)} identities and {len(split.train_poses)} poses to train on; tested on "
+        "split": f"{len(split.train_identities)} identities{drawn(config)} and {len(split.train_poses)} poses to train "
+        "on; tested on "
         f"{len(split.test_identities)} identities and {len(split.test_poses)} poses not seen in training.",
         "steps": summary["steps"],
         "pairs_seen": summary["pairs_seen"],

@@ -24,7 +24,7 @@ from meshkit.data.licensed import SMAL_FAMILIES, load_smal, load_smpl
 from meshkit.data.mesh_pairs import MeshPairs
 from meshkit.data.pairs import PosePairs
 from meshkit.data.pool import MeshPool
-from meshkit.data.rigged import RiggedModel, rotation_matrices
+from meshkit.data.rigged import RiggedModel, rotation_matrices, sample_identities
 from meshkit.data.sampler import PairSampler, pair_loader
 from meshkit.data.store import MeshStore
 
@@ -53,6 +53,7 @@ __all__ = [
     "pair_loader",
     "read_test_list",
     "rotation_matrices",
+    "sample_identities",
     "scan_faust",
     "scan_mgn",
     "scan_pose_transfer",
