@@ -91,7 +91,14 @@ def main() -> None:
         raise UserError(f"--data {cfg.data}: a rigged body is needed, to pose the source like the identity mesh")
     run = Run(cfg.out / cfg.name, resume=False)
     settings = SimpleNamespace(
-        **vars(cfg), model=GeneratorConfig(), pairs=1, seed=0, resample=False, ground_truth=True, pool=0
+        **vars(cfg),
+        model=GeneratorConfig(),
+        pairs=1,
+        seed=0,
+        resample=False,
+        ground_truth=True,
+        pool=0,
+        sampled_identities=0,
     )
     _, pairs = data(settings, run, workers=1)
     assert isinstance(pairs, PosePairs)
