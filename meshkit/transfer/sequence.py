@@ -211,6 +211,7 @@ class _Follower:
         clean = replace(first.clean, verts=scaled[first.clean.source.to(scaled.device)], original=scaled)
         small = clean.verts if first.simple.method == "none" else self._binding.carry(clean.verts)
         simple = replace(first.simple, verts=small, original=clean.verts)
+        descriptors = named(name, lambda: transfer.net.describe(small, simple.faces))
         rotation = before.rotation
         if self._turns and transfer.kind is not None and hasattr(transfer.net.generator, "match"):
             rotation, _ = named(
@@ -219,9 +220,11 @@ class _Follower:
                     transfer.net,
                     small,
                     simple.faces,
+                    descriptors=descriptors,
                     reference=rest_body(transfer.kind or ""),
                     candidates=turns_about(before.rotation),
                     usual=before.rotation[None],
                 ),
             )
-        return replace(first, name=name, clean=clean, simple=simple, rotation=rotation.to(small))
+        rotation = rotation.to(small)
+        return replace(first, name=name, clean=clean, simple=simple, descriptors=descriptors, rotation=rotation)
