@@ -630,6 +630,31 @@ def test_the_command_takes_sequences(person, moves, tmp_path, monkeypatch, capsy
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.parametrize(("count", "said"), [(0, ""), (1, "1 warning: see"), (2, "2 warnings: see")])
+def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypatch):
+    from PIL import Image
+
+    seen = []
+
+    def sheet(rows, *, captions, **_):
+        seen.extend(captions)
+        return Image.new("RGB", (2, 2))
+
+    monkeypatch.setattr("meshkit.transfer.output.contact_sheet", sheet)
+    result = transfer_pose(person, person, weights=copier(), **UPRIGHT)
+    report = replace(result.report, warnings=("odd",) * count)
+    save_picture(tmp_path / "x.png", [replace(result, report=report)], size=20)
+    assert seen[0][2] == (f"{said} the report" if said else "")
+
+
+def test_one_hole_is_a_hole(person, mover):
+    verts, faces = person
+    report = transfer_pose((verts, faces[1:]), mover, weights=copier(), **UPRIGHT).report
+    assert "1 hole (3 boundary edges)" in str(report) and "the surface is open (1 hole)" in str(report)
+    many = transfer_pose((verts, faces[1:-1]), mover, weights=copier(), **UPRIGHT).report
+    assert "2 holes (6 boundary edges)" in str(many)
+
+
 def test_no_results_are_no_picture(tmp_path):
     with pytest.raises(ValueError, match="no results to draw"):
         save_picture(tmp_path / "x.png", [])
@@ -715,6 +740,8 @@ def test_strangers_are_reported(fine_transfer):
 @pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
 def test_the_page_runs(capsys):
     page = Path(__file__).parents[1] / "docs" / "transfer.md"
-    (block,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
-    exec(compile(block, page.name, "exec"), {})
+    blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    names: dict[str, object] = {}
+    exec(compile("\n".join(blocks), page.name, "exec"), names)
     assert "unit cm (guessed from the surface area)" in capsys.readouterr().out
+    assert 1e3 * float(pmd(names["result"].verts[None], center(names["target"]))[0]) < BOUND
