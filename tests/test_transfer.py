@@ -491,6 +491,29 @@ def test_a_sequence_is_as_its_poses_one_by_one(person, moves):
     assert float(torch.cdist(simple.verts, poses[2][0]).amin(1).max()) < 0.05
 
 
+def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
+    looked = []
+    monkeypatch.setattr(
+        "meshkit.transfer._prepare.guess_kind", lambda verts, _: looked.append(len(verts)) or ("animals", True)
+    )
+    poses = [(v, moves[1]) for v in moves[0]]
+    results = list(transfer_sequence(person, poses, weights=copier(data="humans"), **UPRIGHT))
+    assert len(looked) == 2  # the identity and the first pose
+    assert all("pose mesh has the shape of animals" in result.report.warnings[1] for result in results)
+
+
+def test_what_the_reader_says_of_the_first_pose_is_kept(person, moves, tmp_path):
+    (a, b, c), *others = (moves[1] + 1).tolist()
+    beside = next(face for face in others if {a, b} < set(face))
+    (d,) = set(beside) - {a, b}
+    others[others.index(beside)] = [a, d, b, c]  # one quad instead of two triangles
+    lines = [f"v {x} {y} {z}" for x, y, z in moves[0][0].tolist()] + [f"f {' '.join(map(str, f))}" for f in others]
+    (tmp_path / "p0.obj").write_text("\n".join(lines))
+    alone = transfer_pose(person, tmp_path / "p0.obj", weights=copier(), **UPRIGHT).report.pose.notes
+    (result,) = transfer_sequence(person, tmp_path, weights=copier(), **UPRIGHT)
+    assert "split into triangles" in alone[0] and result.report.pose.notes == alone
+
+
 def test_a_broken_pose_in_a_sequence_is_named(person, moves):
     verts = moves[0].clone()
     verts[1, 7] = math.nan

@@ -3,8 +3,10 @@
 import dataclasses
 import os
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -15,8 +17,9 @@ from meshkit.models import PretrainedTransfer
 from meshkit.transfer._frames import DOUBT, UNITS, Scale, axis_name, find_rotation, find_scale, rotations
 from meshkit.transfer._kinds import guess_kind, rest_body
 
-__all__ = ["Mesh", "OpenedMesh", "Prepared", "named", "open_mesh", "prepare", "read"]
+__all__ = ["Mesh", "OpenedMesh", "Prepared", "examine", "named", "open_mesh", "prepare", "read"]
 
+T = TypeVar("T")
 Mesh = str | os.PathLike[str] | tuple[Tensor, Tensor]
 """A mesh file, or vertices (V, 3) and faces (F, 3)."""
 
@@ -141,7 +144,11 @@ def open_mesh(mesh: Mesh, role: str) -> OpenedMesh:
         MeshFileError: the file is missing, damaged or no mesh.
         ValueError: the mesh cannot be used; the message says why.
     """
-    name, verts, faces, notes = read(mesh, role)
+    return examine(*read(mesh, role))
+
+
+def examine(name: str, verts: Tensor, faces: Tensor, notes: tuple[str, ...]) -> OpenedMesh:
+    """As :func:`open_mesh`, of a mesh that was read."""
     report = named(name, lambda: mesh_report(verts, faces))
     clean = named(name, lambda: clean_mesh(verts, faces))
     if len(clean.verts) < _FEWEST:
@@ -248,7 +255,7 @@ def _rotation(
     return rotation, found if clear else f"{found}, in doubt", clear
 
 
-def named(name, make):  # type: ignore[no-untyped-def]
+def named(name: str, make: Callable[[], T]) -> T:
     """Run ``make`` and put the mesh's name before what it complains about."""
     try:
         return make()

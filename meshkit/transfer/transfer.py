@@ -78,9 +78,10 @@ class PoseTransfer:
         opened = cache(lambda: open_mesh(identity, "identity"))
         self.net, self.weights, self._doubts = choose_weights(weights, opened, device=device)
         self.kind: str | None = self.net.card.get("data")
-        self.identity = self._prepare(opened(), identity_unit, identity_up, identity_facing)
+        self.identity = self.prepare(opened(), unit=identity_unit, up=identity_up, facing=identity_facing)
 
-    def _prepare(self, opened: OpenedMesh, unit: str | None, up: str | None, facing: str | None) -> Prepared:
+    def prepare(self, opened: OpenedMesh, *, unit: str | None, up: str | None, facing: str | None) -> Prepared:
+        """Make a mesh ready for the weights: an identity mesh, or a pose mesh for :meth:`apply`."""
         num_verts = self.net.card.get("vertices") or _VERTICES.get(self.kind or "", 1000)
         return prepare(opened, net=self.net, kind=self.kind, num_verts=num_verts, unit=unit, up=up, facing=facing)
 
@@ -95,11 +96,8 @@ class PoseTransfer:
             ValueError: an unknown option, or a mesh that cannot be used.
         """
         start = time.perf_counter()
-        return self.apply(self.prepare_pose(pose, "pose", unit=pose_unit, up=pose_up, facing=pose_facing), start)
-
-    def prepare_pose(self, pose: Mesh, name: str, *, unit: str | None, up: str | None, facing: str | None) -> Prepared:
-        """Make a pose mesh ready, for :meth:`apply`."""
-        return self._prepare(open_mesh(pose, name), unit, up, facing)
+        opened = open_mesh(pose, "pose")
+        return self.apply(self.prepare(opened, unit=pose_unit, up=pose_up, facing=pose_facing), start)
 
     @torch.no_grad()
     def apply(self, other: Prepared, start: float, *, up: Tensor | None = None) -> TransferResult:
