@@ -35,6 +35,7 @@ PAIRS = 400
 Mesh = tuple[torch.Tensor, torch.Tensor]
 
 
+@torch.no_grad()
 def measure(
     nets: Sequence[PretrainedTransfer], kind: str, num_verts: int, pairs: int, seed: int
 ) -> list[list[Confidence]]:
