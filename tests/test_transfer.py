@@ -755,9 +755,11 @@ def test_strangers_are_reported(fine_transfer):
     noise = 0.02 * torch.randn(pose[0].shape, generator=torch.Generator().manual_seed(0))
     upright = {"pose_up": "+z", "pose_facing": "-y"}
     assert "the shape of animals" in transfer((animals.template, animals.faces), **upright).report.warnings[0]
-    for stranger in ((points, torch.tensor(ball.faces)), (bumps, torch.tensor(ball.faces)), (pose[0] + noise, pose[1])):
-        warnings = transfer(stranger, **upright, pose_unit="m").report.warnings
-        assert any("99 of 100" in text for text in warnings), warnings
+    for blob in (points, bumps):
+        warnings = transfer((blob, torch.tensor(ball.faces)), **upright, pose_unit="m").report.warnings
+        assert sum("99 of 100" in text for text in warnings) >= 3, warnings
+    # The matching stands the noise; the surface becomes so large that no body has it.
+    assert any("far from the size" in text for text in transfer((pose[0] + noise, pose[1]), **upright).report.warnings)
 
 
 @pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")

@@ -169,10 +169,12 @@ class PoseTransfer:
 
 def run_network(net: PretrainedTransfer, identity: Prepared, pose: Prepared) -> tuple[GeneratorOutput, Confidence]:
     """What the weights make of two prepared meshes, and the numbers of it."""
+    pair = identity.verts, pose.verts
     faces = {"identity_faces": identity.simple.faces, "pose_faces": pose.simple.faces}
-    said = {"identity_descriptors": identity.descriptors, "pose_descriptors": pose.descriptors}
-    output = net.output(identity.verts, pose.verts, **faces, **said)
-    return output, measure_confidence(net, identity.verts, pose.verts, **faces, **said, output=output)
+    one, two = identity.descriptors, pose.descriptors
+    output = net.output(*pair, **faces, identity_descriptors=one, pose_descriptors=two)
+    numbers = measure_confidence(net, *pair, **faces, output=output, identity_descriptors=one, pose_descriptors=two)
+    return output, numbers
 
 
 def _standing_point(verts: Tensor) -> Tensor:
