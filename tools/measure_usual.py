@@ -133,7 +133,8 @@ def main() -> None:
         if not args.check:
             write_card(WEIGHTS, name, usual, args.pairs)
         flagged = [one.unusual(net.card["usual"]) for one in numbers]
-        print(f"{name}, {args.pairs} pairs: any number {sum(map(bool, flagged)) / len(flagged):.1%} by the old limits")
+        share = sum(map(bool, flagged)) / len(flagged)
+        print(f"{name}, {args.pairs} pairs; beyond the limits that the card had: {share:.1%} by any number")
         for key, bounds in usual.items():
             share = sum(key in names for names in flagged) / len(flagged)
             print(f"  {key:<18} median {bounds['median']:.4f}  limit {bounds['limit']:.4f}  flagged {share:.1%}")
