@@ -16,7 +16,7 @@ from meshkit.batching import center
 from meshkit.data import load_humans, load_shipped
 from meshkit.metrics import edge_ratio, pmd
 from meshkit.transfer import PoseTransfer
-from meshkit.transfer._choose import choose_weights
+from meshkit.transfer._choose import load_weights
 from meshkit.transfer._frames import rotations
 
 
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--refine", type=float, nargs="*", default=[0.03, 0.1, 0.3, 1.0])
     parser.add_argument("--upright", action="store_true", help="leave the meshes as they stand, axes given")
     args = parser.parse_args()
-    net, _ = choose_weights(args.weights, "unread")
+    net = load_weights(args.weights)
     body, split = load_shipped(net.card["data"])
     fine, coarse = (load_humans(n) for n in (6890, 3445)) if net.card["data"] == "humans" else (body, body)
     turns, draw = rotations(), random.Random(0)

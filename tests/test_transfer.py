@@ -38,13 +38,14 @@ from meshkit.transfer import (
 )
 from meshkit.transfer._frames import axis_name, axis_vector, find_scale, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import guess_kind
-from meshkit.transfer._prepare import named
+from meshkit.transfer._prepare import named, open_mesh
 from meshkit.transfer.command import main
 from meshkit.transfer.confidence import row_entropies
 
 UPRIGHT = {"identity_up": "+z", "identity_facing": "-y", "pose_up": "+z", "pose_facing": "-y"}
 Mesh = tuple[Tensor, Tensor]
 WEIGHTS = "corenet3d-humans"
+WIDE = {"edge_change": {"median": 0.0, "limit": 1.0}}  # nothing is unusual
 BOUND = 1.5  # of PMD, in 1e-3 m²
 
 
@@ -237,7 +238,9 @@ def test_unusual_numbers_are_put_into_words():
     assert Confidence(0.5, 0.5, 0.1, 0.2, 9.0).warnings(usual) == ()
     assert Confidence(None, None, 0.1, None, None).warnings(usual) == ()
     (text,) = Confidence(0.5, 0.1, 0.1, 0.2, None).warnings(usual)
-    assert text == "few vertices match both ways: 10%, usually 50%"
+    assert text == "few vertices match both ways: 10.0%; median 50.0%, 99 of 100 above 50.0%"
+    (text,) = Confidence(0.5, 0.5, 0.1, 0.3, None).warnings(usual)
+    assert text == "the identity mesh is unlike the training meshes: 0.300; median 0.200, 99 of 100 below 0.200"
     assert len(Confidence(2.0, 0.1, 0.9, 0.9, None).warnings(usual)) == 4
     with pytest.raises(ValueError, match="needs measured pairs"):
         usual_range([])
@@ -249,12 +252,11 @@ def test_the_report_says_what_was_done(person, mover):
     )
     text = str(result.report)
     assert "simplified to 1000 vertices" in text and "frame    up +z, facing -y (given)" in text
-    assert "UNUSUAL  edges change their length by 0% on average" in text
+    assert "UNUSUAL  edges change their length much: 0.0%" in text
     assert result.report.confidence.edge_change == pytest.approx(0, abs=1e-5)
     assert result.report.confidence.identity_distance is None
     assert "do not say what is usual" in str(transfer_pose(person, mover, weights=copier(), **UPRIGHT).report)
-    wide = copier(usual={"edge_change": {"median": 0.0, "limit": 1.0}})
-    assert "all within what is usual" in str(transfer_pose(person, mover, weights=wide, **UPRIGHT).report)
+    assert "all within what is usual" in str(transfer_pose(person, mover, weights=copier(usual=WIDE), **UPRIGHT).report)
 
 
 # People and animals
@@ -262,10 +264,54 @@ def test_the_report_says_what_was_done(person, mover):
 
 def test_people_and_animals_are_told_apart():
     for kind, poses in (("humans", (0, 400)), ("animals", (0, 200))):
-        body, _ = load_shipped(kind)
-        for pose in poses:
-            verts = body(torch.tensor([5]), torch.tensor([pose]))[0]
-            assert guess_kind(30 * y_up(verts), body.faces)[0] == kind
+        body, split = load_shipped(kind)
+        for who, pose in itertools.product(split.test_identities[:4].tolist(), poses):
+            verts = body(torch.tensor([who]), torch.tensor([pose]))[0]
+            assert guess_kind(30 * y_up(verts), body.faces) == (kind, True)
+
+
+@pytest.mark.parametrize(("resolution", "who"), [(2000, 24), (2000, 40), (2000, 72), (3445, 172), (6890, 168)])
+def test_bodies_once_taken_for_animals_are_people(resolution, who):
+    small = open_mesh(body_of(resolution, who, 10), "identity")
+    assert small.likeness == ("humans", True)
+
+
+def test_a_shape_between_the_kinds_is_taken_for_a_person_in_doubt(person, monkeypatch):
+    monkeypatch.setattr("meshkit.transfer._kinds.shape_numbers", lambda *_: torch.zeros(8))
+    monkeypatch.setattr("meshkit.transfer._kinds._OFFSET", 0.1)
+    assert guess_kind(*person) == ("humans", False)
+    monkeypatch.setattr(choose, "pretrained_names", lambda: ["a", "b"])
+    cards = {"a": "humans", "b": "animals"}
+    monkeypatch.setattr(
+        choose, "load_pretrained", lambda name: copier(name=name, data=cards[name], figures={"pmd": 1.0}, usual=WIDE)
+    )
+    result = transfer_pose(person, person, **UPRIGHT)
+    assert result.report.warnings == (
+        "the identity's shape is between humans' and animals': humans were assumed; name the weights",
+    )
+    text = str(result.report)
+    assert "UNUSUAL  the identity's shape is between" in text and "all within" not in text
+
+
+def test_a_pose_mesh_of_the_other_kind_is_told(person):
+    animals = load_animals()
+    net = copier(data="humans", usual=WIDE)
+    report = transfer_pose(person, (animals.template, animals.faces), weights=net, **UPRIGHT).report
+    assert "these weights are for humans, but the pose mesh has the shape of animals" in report.warnings
+    assert transfer_pose(person, person, weights=net, **UPRIGHT).report.warnings == ()
+
+
+def test_doubt_of_size_and_axes_is_a_warning(person, monkeypatch):
+    net = copier(data="humans", usual=WIDE)
+    odd = (3 * person[0], person[1])
+    (text,) = transfer_pose(odd, person, weights=net, identity_unit="m", **UPRIGHT).report.warnings
+    assert text.startswith("identity: far from the size of the training bodies in the unit given, m: scaled by 0.3")
+    for lead, warned in ((0.01, True), (0.2, False)):
+        monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, lead=lead, **__: (torch.eye(3), lead))
+        report = transfer_pose(person, person, weights=net, identity_up="+z", pose_up="+z").report
+        text = "pose: axes in doubt (up +z, facing -y): give them if they are wrong"
+        assert (text in report.warnings) == warned
+        assert ("all within" in str(report)) != warned
 
 
 def test_auto_takes_the_best_weights_of_the_kind(person, monkeypatch):
@@ -276,23 +322,28 @@ def test_auto_takes_the_best_weights_of_the_kind(person, monkeypatch):
         "load_pretrained",
         lambda name, **_: copier(name=name, data=cards[name][0], figures={"pmd": cards[name][1]}),
     )
-    net, why = choose.choose_weights("auto", person)
+    net, why, doubts = choose.choose_weights("auto", lambda: open_mesh(person, "identity"))
+    assert doubts == ()
     assert net.card["name"] == "b" and "shape is that of humans" in why
     animals = load_animals()
-    net, why = choose.choose_weights("auto", (animals.template, animals.faces))
+    animal = open_mesh((animals.template, animals.faces), "identity")
+    net, *_ = choose.choose_weights("auto", lambda: animal)
     assert net.card["name"] == "c"
     del cards["c"]
     with pytest.raises(ValueError, match="no weights for animals"):
-        choose.choose_weights("auto", (animals.template, animals.faces))
+        choose.choose_weights("auto", lambda: animal)
 
 
 def test_a_runs_folder_gives_weights(tmp_path):
     from safetensors.torch import save_file
 
+    def unread():
+        raise AssertionError("the identity mesh is only looked at to choose")
+
     config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(16, 8))
     save_file(config.build().state_dict(), tmp_path / "model.safetensors")
     (tmp_path / "model.json").write_text('{"extractor_widths": [8, 16], "k": 4, "widths": [16, 8]}')
-    assert choose.choose_weights(tmp_path, "unread")[0].card == {}
+    assert choose.choose_weights(tmp_path, unread)[0].card == {}
     for text, facts in (
         ('{"data": "humans", "vertices": 2000}', {"data": "humans", "vertices": 2000, "name": tmp_path.name}),
         ('{"data": "animals", "vertices": null}', {"data": "animals", "name": tmp_path.name}),
@@ -300,7 +351,7 @@ def test_a_runs_folder_gives_weights(tmp_path):
         ("{", {}),
     ):
         (tmp_path / "config.json").write_text(text)
-        assert choose.choose_weights(str(tmp_path), "unread")[0].card == facts
+        assert choose.choose_weights(str(tmp_path), unread)[0].card == facts
 
 
 # Bad input
@@ -440,6 +491,29 @@ def test_a_sequence_is_as_its_poses_one_by_one(person, moves):
     assert float(torch.cdist(simple.verts, poses[2][0]).amin(1).max()) < 0.05
 
 
+def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
+    looked = []
+    monkeypatch.setattr(
+        "meshkit.transfer._prepare.guess_kind", lambda verts, _: looked.append(len(verts)) or ("animals", True)
+    )
+    poses = [(v, moves[1]) for v in moves[0]]
+    results = list(transfer_sequence(person, poses, weights=copier(data="humans"), **UPRIGHT))
+    assert len(looked) == 2  # the identity and the first pose
+    assert all("pose mesh has the shape of animals" in result.report.warnings[1] for result in results)
+
+
+def test_what_the_reader_says_of_the_first_pose_is_kept(person, moves, tmp_path):
+    (a, b, c), *others = (moves[1] + 1).tolist()
+    beside = next(face for face in others if {a, b} < set(face))
+    (d,) = set(beside) - {a, b}
+    others[others.index(beside)] = [a, d, b, c]  # one quad instead of two triangles
+    lines = [f"v {x} {y} {z}" for x, y, z in moves[0][0].tolist()] + [f"f {' '.join(map(str, f))}" for f in others]
+    (tmp_path / "p0.obj").write_text("\n".join(lines))
+    alone = transfer_pose(person, tmp_path / "p0.obj", weights=copier(), **UPRIGHT).report.pose.notes
+    (result,) = transfer_sequence(person, tmp_path, weights=copier(), **UPRIGHT)
+    assert "split into triangles" in alone[0] and result.report.pose.notes == alone
+
+
 def test_a_broken_pose_in_a_sequence_is_named(person, moves):
     verts = moves[0].clone()
     verts[1, 7] = math.nan
@@ -488,7 +562,7 @@ def test_mistakes_are_one_line_and_status_2(words, message, person, tmp_path, mo
 )
 def test_many_results_never_overwrite_an_input(words, person, moves, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(choose, "_load", lambda *_: copier(data=None))
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
     Path("elsewhere").mkdir()
     for name in ("id.obj", "out_0000.obj"):
         save_mesh(name, *person)
@@ -550,7 +624,7 @@ def test_animals_are_not_said_to_be_in_metres():
 def test_the_command_writes_mesh_picture_and_page(person, mover, tmp_path, monkeypatch, capsys):
     from PIL import Image
 
-    monkeypatch.setattr(choose, "_load", lambda *_: copier(data=None))
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
     save_mesh(tmp_path / "id.ply", *person)
     save_mesh(tmp_path / "pose.obj", *mover)
     axes = ["--identity-up=+z", "--identity-facing=-y", "--pose-up=+z", "--pose-facing=-y", "--weights", "copy"]
@@ -564,7 +638,7 @@ def test_the_command_writes_mesh_picture_and_page(person, mover, tmp_path, monke
 
 
 def test_the_command_takes_sequences(person, moves, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(choose, "_load", lambda *_: copier(data=None))
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
     save_mesh(tmp_path / "id.obj", *person)
     np.savez(tmp_path / "moves.npz", verts=moves[0].numpy(), faces=moves[1].numpy())
     axes = ["--identity-up=+z", "--identity-facing=-y", "--pose-up=+z", "--pose-facing=-y", "--weights", "copy"]
@@ -577,6 +651,31 @@ def test_the_command_takes_sequences(person, moves, tmp_path, monkeypatch, capsy
     for number in range(3):
         assert torch.equal(load_mesh(tmp_path / f"out_{number:04d}.obj")[0], written[number])
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(("count", "said"), [(0, ""), (1, "1 warning: see"), (2, "2 warnings: see")])
+def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypatch):
+    from PIL import Image
+
+    seen = []
+
+    def sheet(rows, *, captions, **_):
+        seen.extend(captions)
+        return Image.new("RGB", (2, 2))
+
+    monkeypatch.setattr("meshkit.transfer.output.contact_sheet", sheet)
+    result = transfer_pose(person, person, weights=copier(), **UPRIGHT)
+    report = replace(result.report, warnings=("odd",) * count)
+    save_picture(tmp_path / "x.png", [replace(result, report=report)], size=20)
+    assert seen[0][2] == (f"{said} the report" if said else "")
+
+
+def test_one_hole_is_a_hole(person, mover):
+    verts, faces = person
+    report = transfer_pose((verts, faces[1:]), mover, weights=copier(), **UPRIGHT).report
+    assert "1 hole (3 boundary edges)" in str(report) and "the surface is open (1 hole)" in str(report)
+    many = transfer_pose((verts, faces[1:-1]), mover, weights=copier(), **UPRIGHT).report
+    assert "2 holes (6 boundary edges)" in str(many)
 
 
 def test_no_results_are_no_picture(tmp_path):
@@ -651,14 +750,23 @@ def test_strangers_are_reported(fine_transfer):
     assert transfer(pose).report.warnings == ()
     animals = load_animals()
     ball = trimesh.creation.icosphere(4)
-    strangers = [(animals.template, animals.faces), (torch.tensor(ball.vertices).float(), torch.tensor(ball.faces))]
-    for stranger in strangers:
-        assert transfer(stranger).report.warnings
+    points = torch.tensor(ball.vertices).float()
+    bumps = (1 + 0.3 * torch.sin(5 * points).prod(1, keepdim=True)) * points
+    noise = 0.02 * torch.randn(pose[0].shape, generator=torch.Generator().manual_seed(0))
+    upright = {"pose_up": "+z", "pose_facing": "-y"}
+    assert "the shape of animals" in transfer((animals.template, animals.faces), **upright).report.warnings[0]
+    for blob in (points, bumps):
+        warnings = transfer((blob, torch.tensor(ball.faces)), **upright, pose_unit="m").report.warnings
+        assert sum("99 of 100" in text for text in warnings) >= 3, warnings
+    # The matching stands the noise; the surface becomes so large that no body has it.
+    assert any("far from the size" in text for text in transfer((pose[0] + noise, pose[1]), **upright).report.warnings)
 
 
 @pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
 def test_the_page_runs(capsys):
     page = Path(__file__).parents[1] / "docs" / "transfer.md"
-    (block,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
-    exec(compile(block, page.name, "exec"), {})
+    blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    names: dict[str, object] = {}
+    exec(compile("\n".join(blocks), page.name, "exec"), names)
     assert "unit cm (guessed from the surface area)" in capsys.readouterr().out
+    assert 1e3 * float(pmd(names["result"].verts[None], center(names["target"]))[0]) < BOUND

@@ -4,7 +4,7 @@
 
 Writes meshkit/weights/NAME.safetensors (the residual blocks as float16, the rest as float32), NAME.json and NAME.md,
 after checking that the network with rounded parameters gives the run's vertices within a thousandth of a metre, and
-measuring what is usual on test pairs for the transfer's honesty report.
+measuring what is usual on unseen bodies for the transfer's report (tools/measure_usual.py).
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from measure_usual import PAIRS, measure, usual_section
 from safetensors.torch import save_file
 
 from meshkit.batching import center
-from meshkit.data import load_humans, load_shipped
-from meshkit.io import atomic_write, simplify
+from meshkit.data import load_shipped
+from meshkit.io import atomic_write
 from meshkit.metrics import pmd
 from meshkit.models import PretrainedTransfer, load_generator, pretrained_names
-from meshkit.transfer import measure_confidence, usual_range
+from meshkit.transfer import usual_range
 
 ROOT = Path(__file__).parents[1]
 WEIGHTS = ROOT / "meshkit" / "weights"
@@ -96,39 +97,6 @@ def errors(run: PretrainedTransfer, body: Any, pairs: torch.Tensor) -> list[floa
     return found
 
 
-@torch.no_grad()
-def measure_usual(net: PretrainedTransfer, body: Any, pairs: torch.Tensor) -> dict[str, Any]:
-    """What the honesty report compares with, over test pairs.
-
-    Meshes of other origin are simplified to the size of the training meshes and have other triangles. So on every
-    second pair the meshes are made finer and simplified back.
-    """
-    measured = []
-    for number, (a, p, b, q) in enumerate(pairs.tolist()):
-        meshes = []
-        for who, how in ((a, p), (b, q)):
-            verts = body(torch.tensor([who]), torch.tensor([how]))[0]
-            meshes.append(retriangulated(body, who, how) if number % 2 else (verts, body.faces))
-        (identity, identity_faces), (pose, pose_faces) = meshes
-        sides = {"identity_faces": identity_faces, "pose_faces": pose_faces}
-        output = net.output(identity, pose, **sides)
-        measured.append(measure_confidence(net, identity, pose, **sides, output=output))
-    return usual_range(measured)
-
-
-def retriangulated(body: Any, identity: int, pose: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """A posed body with as many vertices as ``body``, but other ones."""
-    import trimesh
-
-    fine = load_humans(6890) if len(body.identities) == len(load_humans().identities) else body
-    verts, faces = fine(torch.tensor([identity]), torch.tensor([pose]))[0], fine.faces
-    if fine is body:
-        points, triangles = trimesh.remesh.subdivide(verts.numpy(), faces.numpy())
-        verts, faces = torch.from_numpy(points).float(), torch.from_numpy(triangles).long()
-    small = simplify(verts, faces, len(body.template))
-    return small.verts, small.faces
-
-
 def recipe_of(config: dict[str, Any]) -> str:
     """The recipe that a run's settings are of.
 
@@ -182,7 +150,6 @@ def network(card: dict[str, Any]) -> str:
 def markdown(name: str, card: dict[str, Any]) -> str:
     figures = card["figures"]
     rows = "\n".join(f"| {key} | {value} |" for key, value in figures.items())
-    usual = "\n".join(f"| {key} | {v['median']} | {v['limit']} |" for key, v in card["usual"].items())
     machine = card["machine"]
     processor = machine["gpu"] or machine["processor"]
     minutes = card["train_minutes"]
@@ -221,16 +188,7 @@ identity and the warped mesh would score.
 |---|---:|
 {rows}
 
-## What is usual
-
-Over the first {card["usual_pairs"]} test pairs, every second one with other triangles than those of training.
-`meshkit.transfer` calls a transfer unusual when a number lies beyond the limit (99 of 100 of these pairs lie within);
-`meshkit.transfer.Confidence` says what the numbers are.
-
-| number | median | limit |
-|---|---:|---:|
-{usual}
-
+{usual_section(card)}
 ## Limits
 
 Bodies, poses and animals unlike the training set; several people in one mesh; clothes and hair that are not one surface
@@ -249,7 +207,7 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="folder of a finished run")
     parser.add_argument("name", help="name of the weights, such as xdualnet-humans")
     parser.add_argument("--out", type=Path, default=WEIGHTS)
-    parser.add_argument("--usual-pairs", type=int, default=100, help="test pairs for the usual range")
+    parser.add_argument("--usual-pairs", type=int, default=PAIRS, help="pairs for the usual range")
     args = parser.parse_args()
     try:
         generator, model = load_generator(args.run)
@@ -296,8 +254,8 @@ def main() -> None:
         "licence": LICENCES[config["data"]],
         "first_pairs_pmd": errors(run, body, split.test_pairs[:8]),
         "rounding": {moved: round(distance, 6), "pairs": len(pairs)},
-        "usual": measure_usual(net, body, split.test_pairs[: args.usual_pairs]),
-        "usual_pairs": min(args.usual_pairs, len(split.test_pairs)),
+        "usual": usual_range(measure([net], config["data"], len(body.template), args.usual_pairs, seed=0)[0]),
+        "usual_pairs": args.usual_pairs,
         "model": asdict(model),
     }
     with atomic_write(args.out / f"{args.name}.safetensors") as path:

@@ -13,6 +13,12 @@ __all__ = ["MeshReport", "mesh_report"]
 Corner = tuple[float, float, float]
 
 
+def counted(count: int, thing: str) -> str:
+    """A number of things, in the right plural: ``"1 hole"``, ``"2 vertices"``."""
+    plural = f"{thing[:-2]}ices" if thing.endswith("ex") else f"{thing}s"
+    return f"{count} {thing if count == 1 else plural}"
+
+
 @dataclass(frozen=True)
 class MeshReport:
     """Facts about a mesh, from :func:`mesh_report`; ``print`` it to read them.
@@ -77,16 +83,18 @@ class MeshReport:
         """What :func:`meshkit.io.clean_mesh` would change or a user should know, in words."""
         size = self.components
         found = {
-            f"{self.degenerate_faces} degenerate faces": self.degenerate_faces,
-            f"{self.duplicate_faces} repeated faces": self.duplicate_faces,
-            f"{self.duplicate_verts} repeated vertices": self.duplicate_verts,
-            f"{self.unreferenced_verts} vertices in no face": self.unreferenced_verts,
-            f"{self.crowded_edges} edges with more than two faces": self.crowded_edges,
-            f"{self.touching_verts} vertices where fans of faces touch": self.touching_verts,
-            f"{self.flipped_edges} edges whose faces are turned differently": self.flipped_edges,
+            counted(self.degenerate_faces, "degenerate face"): self.degenerate_faces,
+            counted(self.duplicate_faces, "repeated face"): self.duplicate_faces,
+            counted(self.duplicate_verts, "repeated vertex"): self.duplicate_verts,
+            f"{counted(self.unreferenced_verts, 'vertex')} in no face": self.unreferenced_verts,
+            f"{counted(self.crowded_edges, 'edge')} with more than two faces": self.crowded_edges,
+            f"{counted(self.touching_verts, 'vertex')} where fans of faces touch": self.touching_verts,
+            f"{counted(self.flipped_edges, 'edge')} whose faces are turned differently": self.flipped_edges,
             f"{len(size)} parts (faces: {', '.join(map(str, size[:5]))}{', ...' if len(size) > 5 else ''})": len(size)
             > 1,
-            f"{self.boundary_loops} holes ({self.boundary_edges} boundary edges)": self.boundary_edges,
+            f"{counted(self.boundary_loops, 'hole')} ({counted(self.boundary_edges, 'boundary edge')})": (
+                self.boundary_edges
+            ),
             "turned inside out (negative volume)": self.volume is not None and self.volume < 0,
         }
         return tuple(text for text, count in found.items() if count)

@@ -86,11 +86,16 @@ class PretrainedTransfer(nn.Module):
         pose_faces: Tensor | None = None,
         identity_mask: Tensor | None = None,
         pose_mask: Tensor | None = None,
+        identity_descriptors: Tensor | None = None,
+        pose_descriptors: Tensor | None = None,
     ) -> GeneratorOutput:
-        """As calling the module, with the warped mesh and the matching besides; the plan is always of a batch."""
+        """As calling the module, with the warped mesh and the matching besides; the plan is always of a batch.
+
+        ``identity_descriptors`` and ``pose_descriptors`` are what :meth:`describe` gives, where it was asked already.
+        """
         single = identity.dim() == pose.dim() == 2
-        first = self._side(identity, identity_faces, identity_mask, "identity")
-        second = self._side(pose, pose_faces, pose_mask, "pose")
+        first = self._side(identity, identity_faces, identity_mask, identity_descriptors, "identity")
+        second = self._side(pose, pose_faces, pose_mask, pose_descriptors, "pose")
         batch = max(len(first["identity"]), len(second["pose"]))
         inputs = {name: _repeated(value, batch) for name, value in (first | second).items() if value is not None}
         result = self.generator(**inputs)
@@ -118,7 +123,9 @@ class PretrainedTransfer(nn.Module):
             verts, faces, num_signatures=self.config.num_signatures, mask=mask, method="fast"
         ).to(verts.dtype)
 
-    def _side(self, verts: Tensor, faces: Tensor | None, mask: Tensor | None, name: str) -> dict[str, Any]:
+    def _side(
+        self, verts: Tensor, faces: Tensor | None, mask: Tensor | None, descriptors: Tensor | None, name: str
+    ) -> dict[str, Any]:
         """What the generator is told of one of the two meshes, or batches of meshes."""
         if verts.dim() not in (2, 3) or verts.shape[-1] != 3:
             raise ValueError(f"{name} must be (V, 3) or (B, V, 3), got {tuple(verts.shape)}")
@@ -130,7 +137,10 @@ class PretrainedTransfer(nn.Module):
         k = self.config.k if self.config.architecture == "matching" and self.config.extractor == "setconv" else 1
         if verts.shape[1] < k:
             raise ValueError(f"{name} has {verts.shape[1]} vertices; these weights look at {k} neighbours of each")
-        descriptors = self.describe(verts, faces, mask)
+        if descriptors is None:
+            descriptors = self.describe(verts, faces, mask)
+        elif descriptors.dim() == 2:
+            descriptors = descriptors[None]
         centred = center(verts, mask)
         sides: dict[str, Any] = {name: centred, f"{name}_mask": mask}
         if isinstance(self.generator, PoseTransferGenerator):

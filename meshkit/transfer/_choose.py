@@ -2,29 +2,41 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
-from meshkit.io import clean_mesh, simplify
 from meshkit.models import PretrainedTransfer, load_generator, load_pretrained, pretrained_names
-from meshkit.transfer._kinds import guess_kind
-from meshkit.transfer._prepare import Mesh, named, read
+from meshkit.transfer._prepare import OpenedMesh
 
-__all__ = ["Weights", "choose_weights"]
+__all__ = ["Choice", "Weights", "choose_weights", "load_weights"]
 
 Weights = str | os.PathLike[str] | PretrainedTransfer
 """``"auto"``, a name of shipped weights, the folder of a training run, or a network."""
 
 
-def choose_weights(
-    weights: Weights, identity: Mesh, *, device: torch.device | str | None = None
-) -> tuple[PretrainedTransfer, str]:
-    """The network, and what there is to say of the choice.
+class Choice(NamedTuple):
+    """The network, which it is and why, and what may be wrong with the choice."""
 
-    ``"auto"`` takes people's or animals' weights by the shape of the identity mesh, and of those the ones with the
-    lowest error on unseen pairs.
+    net: PretrainedTransfer
+    why: str
+    doubts: tuple[str, ...] = ()
+
+
+def choose_weights(
+    weights: Weights, identity: Callable[[], OpenedMesh], *, device: torch.device | str | None = None
+) -> Choice:
+    """The network to transfer with.
+
+    ``"auto"`` takes people's or animals' weights by the shape of the identity mesh, people's if it is not clear, and of
+    those the ones with the lowest error on unseen pairs.
+
+    Args:
+        weights: see :data:`Weights`.
+        identity: opens the identity mesh, if it has to be looked at.
+        device: where to compute; that of the network, or the CPU, if ``None``.
 
     Raises:
         ValueError: no such weights, or none to choose from.
@@ -33,19 +45,22 @@ def choose_weights(
     if device is not None:
         _check_device(device)
     if isinstance(weights, PretrainedTransfer):
-        return (weights if device is None else weights.to(device)).eval(), weights.card.get("name", "the given network")
+        net = (weights if device is None else weights.to(device)).eval()
+        return Choice(net, net.card.get("name", "the given network"))
     if weights != "auto":
-        return _load(weights, device or "cpu"), os.fspath(weights)
-    name, verts, faces, _ = read(identity, "identity")
-    clean = named(name, lambda: clean_mesh(verts, faces))
-    small = named(name, lambda: simplify(clean.verts, clean.faces, 1000))
-    kind, clear = named(name, lambda: guess_kind(small.verts, small.faces))
+        return Choice(load_weights(weights, device or "cpu"), os.fspath(weights))
+    kind, clear = identity().likeness
     fitting = [net for net in map(load_pretrained, pretrained_names()) if net.card["data"] == kind]
     if not fitting:
         raise ValueError(f"no weights for {kind} come with this installation: name some, or the folder of a run")
     best = min(fitting, key=lambda net: net.card["figures"]["pmd"])
-    doubt = "" if clear else ", though not clearly: name the weights if this is wrong"
-    return best.to(device or "cpu"), f"{best.card['name']}, as the identity's shape is that of {kind}{doubt}"
+    why = f"{best.card['name']}, as the identity's shape is {'' if clear else 'more or less '}that of {kind}"
+    doubts = (
+        ()
+        if clear
+        else (f"the identity's shape is between humans' and animals': {kind} were assumed; name the weights",)
+    )
+    return Choice(best.to(device or "cpu"), why, doubts)
 
 
 def _check_device(device: torch.device | str) -> None:
@@ -55,7 +70,12 @@ def _check_device(device: torch.device | str) -> None:
         raise ValueError(f"device {device} cannot be used: {(str(error).splitlines() or [''])[0]}") from error
 
 
-def _load(weights: str | os.PathLike[str], device: torch.device | str) -> PretrainedTransfer:
+def load_weights(weights: str | os.PathLike[str], device: torch.device | str = "cpu") -> PretrainedTransfer:
+    """Shipped weights by their name, or those in the folder of a run.
+
+    Raises:
+        ValueError: there are none.
+    """
     if weights in pretrained_names():
         return load_pretrained(str(weights), device=device)
     folder = Path(weights)

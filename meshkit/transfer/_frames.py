@@ -9,6 +9,8 @@ from torch import Tensor
 
 from meshkit.batching import center
 from meshkit.models import PoseTransferGenerator, PretrainedTransfer
+from meshkit.models._released_matching import DensePlan
+from meshkit.ot import TransportPlan
 from meshkit.topology import vertex_normals
 from meshkit.transfer.confidence import row_entropies
 
@@ -116,6 +118,14 @@ class Scale:
         """What coordinates are multiplied with for the weights."""
         return self.metres * self.fit
 
+    @property
+    def doubt(self) -> str:
+        """What is odd about the size, in words; empty if nothing is."""
+        if self.fit == 1 or not (self.metric or self.given):
+            return ""
+        unit = f"the unit given, {self.unit}" if self.given else "any unit"
+        return f"far from the size of the training bodies in {unit}: scaled by {self.fit:.3g}"
+
     def __str__(self) -> str:
         text = f"{self.unit} ({'given' if self.given else 'guessed from the surface area'})"
         if not self.metric and not self.given:
@@ -160,6 +170,7 @@ def find_rotation(
     verts: Tensor,
     faces: Tensor,
     *,
+    descriptors: Tensor | None,
     reference: tuple[Tensor, Tensor],
     candidates: Tensor,
     usual: Tensor | None = None,
@@ -181,6 +192,7 @@ def find_rotation(
         net: weights with a matching.
         verts: (V, 3), scaled to metres.
         faces: (F, 3).
+        descriptors: (V, D) what the weights say of the mesh; ``None`` if they take none.
         reference: vertices and faces of a rest body in the frame of the weights.
         candidates: (R, 3, 3) rotations.
         usual: (K, 3, 3) those of them that another must beat by 0.05, as most files have them; if ``None``, up +z,
@@ -198,14 +210,13 @@ def find_rotation(
     rest_features = generator.encode(center(rest[None]), descriptors=_batched(net.describe(rest, rest_faces)))
     surface = torch.cat([center(rest[None])[0], vertex_normals(rest, rest_faces)], 1)[None]
     normals = vertex_normals(verts, faces)
-    descriptors = _batched(net.describe(verts, faces))
     scores = []
     for rotation in candidates.to(verts):
         turned = center((verts @ rotation.T)[None])
-        plan = generator.match(generator.encode(turned, descriptors=descriptors), rest_features)
+        plan = generator.match(generator.encode(turned, descriptors=_batched(descriptors)), rest_features)
         there = plan.barycentric(surface)[0]
         like = _correlation(turned[0] - turned[0].mean(0), there[:, :3] - there[:, :3].mean(0))
-        like = like - float(row_entropies(plan.dense()[0]).mean())
+        like = like - _mean_row_entropy(plan)
         scores.append(_correlation(normals @ rotation.T, there[:, 3:]) + like / 8)
     usual = torch.cat([rotations("+z", "-y"), rotations("+y", "+z")]) if usual is None else usual
     favoured = (candidates[:, None] == usual.to(candidates)).all(-1).all(-1).any(1)
@@ -213,6 +224,12 @@ def find_rotation(
     best = int((score + _CLEAR * favoured.cpu()).argmax())
     others = score[torch.arange(len(score)) != best]
     return candidates[best], float(score[best] - others.max())
+
+
+def _mean_row_entropy(plan: TransportPlan | DensePlan) -> float:
+    if isinstance(plan, TransportPlan):  # its rows sum to 1 / N each; far cheaper than to write out the matrix
+        return float(plan.entropy()[0]) - math.log(plan.shape[1])
+    return float(row_entropies(plan.dense()[0]).mean())
 
 
 def _correlation(a: Tensor, b: Tensor) -> float:

@@ -3,22 +3,64 @@
 import dataclasses
 import os
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from meshkit.io import CleanMesh, MeshFileError, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
+from meshkit.io.report import counted
 from meshkit.models import PretrainedTransfer
 from meshkit.transfer._frames import DOUBT, UNITS, Scale, axis_name, find_rotation, find_scale, rotations
-from meshkit.transfer._kinds import rest_body
+from meshkit.transfer._kinds import guess_kind, rest_body
 
-__all__ = ["Mesh", "Prepared", "prepare", "read"]
+__all__ = ["Mesh", "OpenedMesh", "Prepared", "examine", "named", "open_mesh", "prepare", "read"]
 
+T = TypeVar("T")
 Mesh = str | os.PathLike[str] | tuple[Tensor, Tensor]
 """A mesh file, or vertices (V, 3) and faces (F, 3)."""
 
 _FEWEST = 64  # the signatures rest on 64 eigenpairs
+_LOOKED_AT = 1000  # vertices that tell people from animals
+
+
+@dataclass(frozen=True)
+class OpenedMesh:
+    """One mesh as it came, and its clean surface: what does not depend on the weights.
+
+    Attributes:
+        name: of the file, or what the mesh is for.
+        faces: (F, 3) as they came.
+        report: on the mesh as it came.
+        clean: the one clean surface of it, in the file's axes and unit.
+        notes: what was done or should be known.
+    """
+
+    name: str
+    faces: Tensor
+    report: MeshReport
+    clean: CleanMesh
+    notes: tuple[str, ...]
+
+    def simplified(self, num_verts: int) -> SimpleMesh:
+        """The clean surface with ``num_verts`` vertices, as far as it has more."""
+        return self._looked_at if num_verts == _LOOKED_AT else self._simplify(num_verts)
+
+    @cached_property
+    def likeness(self) -> tuple[str, bool]:
+        """What :func:`guess_kind` says of it."""
+        small = self._looked_at
+        return named(self.name, lambda: guess_kind(small.verts, small.faces))
+
+    @cached_property
+    def _looked_at(self) -> SimpleMesh:
+        return self._simplify(_LOOKED_AT)
+
+    def _simplify(self, num_verts: int) -> SimpleMesh:
+        return named(self.name, lambda: simplify(self.clean.verts, self.clean.faces, num_verts))
 
 
 @dataclass(frozen=True)
@@ -31,9 +73,12 @@ class Prepared:
         report: on the mesh as it came.
         clean: the one clean surface of it, scaled.
         simple: that with fewer vertices.
+        descriptors: (N, D) what the weights take of the simple mesh; ``None`` if they take none.
         scale: how its lengths became metres.
         rotation: (3, 3) takes the file's axes to those of the weights.
         found: how ``rotation`` came about.
+        likeness: ``"humans"`` or ``"animals"``, whichever it is more like, and whether that is clear.
+        doubts: what may be wrong with it, in words.
         notes: what was done or should be known.
     """
 
@@ -42,9 +87,12 @@ class Prepared:
     report: MeshReport
     clean: CleanMesh
     simple: SimpleMesh
+    descriptors: Tensor | None
     scale: Scale
     rotation: Tensor
     found: str
+    likeness: tuple[str, bool]
+    doubts: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
@@ -85,9 +133,35 @@ def read(mesh: Mesh, role: str) -> tuple[str, Tensor, Tensor, tuple[str, ...]]:
     return role, mesh[0].detach(), mesh[1], ()
 
 
+def open_mesh(mesh: Mesh, role: str) -> OpenedMesh:
+    """Read a mesh, report on it and clean it.
+
+    Args:
+        mesh: file or tensors.
+        role: what it is for, for messages.
+
+    Raises:
+        MeshFileError: the file is missing, damaged or no mesh.
+        ValueError: the mesh cannot be used; the message says why.
+    """
+    return examine(*read(mesh, role))
+
+
+def examine(name: str, verts: Tensor, faces: Tensor, notes: tuple[str, ...]) -> OpenedMesh:
+    """As :func:`open_mesh`, of a mesh that was read."""
+    report = named(name, lambda: mesh_report(verts, faces))
+    clean = named(name, lambda: clean_mesh(verts, faces))
+    if len(clean.verts) < _FEWEST:
+        raise ValueError(
+            f"{name}: {len(clean.verts)} vertices in its largest part; a body needs {_FEWEST} or more to be recognised"
+        )
+    if clean.changes:
+        notes += (f"cleaned: {clean}",)
+    return OpenedMesh(name, faces, report, clean, notes)
+
+
 def prepare(
-    mesh: Mesh,
-    role: str,
+    opened: OpenedMesh,
     *,
     net: PretrainedTransfer,
     kind: str | None,
@@ -96,11 +170,10 @@ def prepare(
     up: str | None = None,
     facing: str | None = None,
 ) -> Prepared:
-    """Report on a mesh, clean, scale, simplify and orient it.
+    """Scale, simplify and orient a mesh.
 
     Args:
-        mesh: file or tensors.
-        role: what it is for, for messages.
+        opened: the mesh.
         net: the weights, which find the orientation.
         kind: ``"humans"`` or ``"animals"``, whose mean body gives size and frame; ``None`` if the weights know neither:
             then unit, up and facing must be given or clear from the mesh.
@@ -110,63 +183,79 @@ def prepare(
         facing: signed axis that the body looks along; found if ``None``.
 
     Raises:
-        MeshFileError: the file is missing, damaged or no mesh.
         ValueError: the mesh cannot be used; the message says why.
     """
-    name, verts, faces, notes = read(mesh, role)
-    report = named(name, lambda: mesh_report(verts, faces))
-    clean = named(name, lambda: clean_mesh(verts, faces))
-    if len(clean.verts) < _FEWEST:
-        raise ValueError(
-            f"{name}: {len(clean.verts)} vertices in its largest part; a body needs {_FEWEST} or more to be recognised"
-        )
-    if clean.changes:
-        notes += (f"cleaned: {clean}",)
+    name, report, clean, notes = opened.name, opened.report, opened.clean, opened.notes
     net_device = next(net.parameters()).device
     among = ("m", "cm", "mm") if kind == "animals" else tuple(UNITS)
     area = _area(clean.verts, clean.faces)
     scale = named(name, lambda: find_scale(area, _reference_area(kind), unit, among=among))
     scale = dataclasses.replace(scale, metric=kind != "animals")
+
+    def scaled(verts: Tensor) -> Tensor:
+        return (verts * scale.factor).float().to(net_device)
+
     metric = dataclasses.replace(
-        clean,
-        verts=(clean.verts * scale.factor).float().to(net_device),
-        faces=clean.faces.to(net_device),
-        original=(clean.original * scale.factor).float().to(net_device),
+        clean, verts=scaled(clean.verts), faces=clean.faces.to(net_device), original=scaled(clean.original)
     )
-    simple = named(name, lambda: simplify(metric.verts, metric.faces, num_verts))
+    simple = opened.simplified(num_verts)
+    simple = dataclasses.replace(
+        simple,
+        verts=scaled(simple.verts),
+        faces=simple.faces.to(net_device),
+        original=metric.verts,
+        original_faces=metric.faces,
+    )
     if simple.method != "none":
         notes += (f"simplified to {len(simple.verts)} vertices",)
     elif len(simple.verts) < 0.8 * num_verts:
         notes += (f"only {len(simple.verts)} vertices; the weights are used to {num_verts}",)
     if report.boundary_edges:
-        notes += (f"the surface is open ({report.boundary_loops} holes), which the weights have not seen",)
-    rotation, found = named(name, lambda: _rotation(report, simple, net, kind, up, facing))
-    return Prepared(name, faces, report, metric, simple, scale, rotation.to(metric.verts), found, notes)
+        notes += (f"the surface is open ({counted(report.boundary_loops, 'hole')}), which the weights have not seen",)
+    descriptors = named(name, lambda: net.describe(simple.verts, simple.faces))
+    rotation, found, clear = named(name, lambda: _rotation(report, simple, descriptors, net, kind, up, facing))
+    doubts: tuple[str, ...] = (f"{name}: {scale.doubt}",) if scale.doubt else ()
+    if not clear:
+        axes = f"up {axis_name(rotation[2])}, facing {axis_name(-rotation[1])}"
+        doubts += (f"{name}: axes in doubt ({axes}): give them if they are wrong",)
+    likeness = named(name, lambda: guess_kind(simple.verts, simple.faces))
+    rotation = rotation.to(metric.verts)
+    return Prepared(
+        name, opened.faces, report, metric, simple, descriptors, scale, rotation, found, likeness, doubts, notes
+    )
 
 
 def _rotation(
     report: MeshReport,
     simple: SimpleMesh,
+    descriptors: Tensor | None,
     net: PretrainedTransfer,
     kind: str | None,
     up: str | None,
     facing: str | None,
-) -> tuple[Tensor, str]:
+) -> tuple[Tensor, str, bool]:
+    """The rotation, how it came about, and whether it is clear."""
     if up is not None and facing is not None:
-        return rotations(up, facing)[0], "given"
+        return rotations(up, facing)[0], "given", True
     if kind is None:
         up, facing = up or report.up, facing or report.facing
         if up is None or facing is None:
             raise ValueError("up and facing are not clear, and these weights do not say what they know: give both")
-        return rotations(up, facing)[0], "guessed from symmetry and feet"
+        return rotations(up, facing)[0], "guessed from symmetry and feet", True
     rotation, lead = find_rotation(
-        net, simple.verts, simple.faces, reference=rest_body(kind), candidates=rotations(up, facing)
+        net,
+        simple.verts,
+        simple.faces,
+        descriptors=descriptors,
+        reference=rest_body(kind),
+        candidates=rotations(up, facing),
     )
     found = "found by matching to a rest body" if up is None and facing is None else "partly given"
-    return rotation, found if lead > DOUBT else f"{found}, in doubt: give it if it is wrong"
+    clear = lead > DOUBT
+    return rotation, found if clear else f"{found}, in doubt", clear
 
 
-def named(name, make):  # type: ignore[no-untyped-def]
+def named(name: str, make: Callable[[], T]) -> T:
     """Run ``make`` and put the mesh's name before what it complains about."""
     try:
         return make()

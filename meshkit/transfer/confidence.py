@@ -14,14 +14,14 @@ from meshkit.models import GeneratorOutput, PretrainedTransfer
 
 __all__ = ["Confidence", "measure_confidence", "row_entropies", "usual_range"]
 
-# Field, whether large values are the unusual ones, and what an unusual value says.
+# Field, whether large values are the unusual ones, how they are written, and what an unusual one says.
 _MEANINGS = (
-    ("match_spread", True, "the matching is vague: a vertex matches {value:.1%} of the pose mesh, usually {usual:.1%}"),
-    ("mutual_share", False, "few vertices match both ways: {value:.0%}, usually {usual:.0%}"),
-    ("edge_change", True, "edges change their length by {value:.0%} on average, usually {usual:.0%}"),
-    ("identity_distance", True, "the identity mesh is unlike training meshes: {value:.2f} off, usually {usual:.2f}"),
-    ("pose_distance", True, "the pose mesh is unlike training meshes: {value:.2f} off, usually {usual:.2f}"),
-)  # fmt: skip
+    ("match_spread", True, ".1%", "the matching is vague, a vertex matches this much of the pose mesh"),
+    ("mutual_share", False, ".1%", "few vertices match both ways"),
+    ("edge_change", True, ".1%", "edges change their length much"),
+    ("identity_distance", True, ".3f", "the identity mesh is unlike the training meshes"),
+    ("pose_distance", True, ".3f", "the pose mesh is unlike the training meshes"),
+)
 
 
 @dataclass(frozen=True)
@@ -46,18 +46,36 @@ class Confidence:
 
     def warnings(self, usual: Mapping[str, Mapping[str, float]]) -> tuple[str, ...]:
         """What is unusual, in words; ``usual`` is :func:`usual_range` of ordinary pairs, which model cards hold."""
+        found, unusual = [], self.unusual(usual)
+        for name, high_is_odd, form, text in _MEANINGS:
+            if name in unusual:
+                value, median, limit = getattr(self, name), usual[name]["median"], usual[name]["limit"]
+                side = "below" if high_is_odd else "above"
+                found.append(f"{text}: {value:{form}}; median {median:{form}}, 99 of 100 {side} {limit:{form}}")
+        return tuple(found)
+
+    def unusual(self, usual: Mapping[str, Mapping[str, float]]) -> tuple[str, ...]:
+        """Names of the numbers beyond their limit."""
         found = []
-        for name, high_is_odd, text in _MEANINGS:
+        for name, high_is_odd, *_ in _MEANINGS:
             value, bounds = getattr(self, name), usual.get(name)
             if value is not None and bounds is not None:
                 odd = value > bounds["limit"] if high_is_odd else value < bounds["limit"]
-                found += [text.format(value=value, usual=bounds["median"])] if odd else []
+                found += [name] if odd else []
         return tuple(found)
 
 
 @torch.no_grad()
 def measure_confidence(
-    net: PretrainedTransfer, identity: Tensor, pose: Tensor, *, identity_faces: Tensor, pose_faces: Tensor, output: Any
+    net: PretrainedTransfer,
+    identity: Tensor,
+    pose: Tensor,
+    *,
+    identity_faces: Tensor,
+    pose_faces: Tensor,
+    output: Any,
+    identity_descriptors: Tensor | None = None,
+    pose_descriptors: Tensor | None = None,
 ) -> Confidence:
     """Measure one transfer.
 
@@ -68,6 +86,8 @@ def measure_confidence(
         identity_faces: (F, 3).
         pose_faces: (G, 3).
         output: what ``net.output`` made of them, for one pair.
+        identity_descriptors: (V, D) what ``net.describe`` says of the identity mesh, if it was asked already.
+        pose_descriptors: (W, D) likewise.
     """
     result: GeneratorOutput = output
     spread = mutual = None
@@ -81,8 +101,8 @@ def measure_confidence(
         match_spread=spread,
         mutual_share=mutual,
         edge_change=float(edge_ratio(vertices, identity[None], identity_faces)[0]),
-        identity_distance=_distance(net, identity, identity_faces),
-        pose_distance=_distance(net, pose, pose_faces),
+        identity_distance=_distance(net, identity, identity_faces, identity_descriptors),
+        pose_distance=_distance(net, pose, pose_faces, pose_descriptors),
     )
 
 
@@ -92,8 +112,8 @@ def row_entropies(plan: Tensor) -> Tensor:
     return -torch.special.xlogy(share, share).sum(1)
 
 
-def _distance(net: PretrainedTransfer, verts: Tensor, faces: Tensor) -> float | None:
-    descriptors = net.describe(verts, faces)
+def _distance(net: PretrainedTransfer, verts: Tensor, faces: Tensor, descriptors: Tensor | None) -> float | None:
+    descriptors = net.describe(verts, faces) if descriptors is None else descriptors
     if descriptors is None:
         return None
     mean, std = (getattr(net.generator, f"descriptor_{name}").to(descriptors) for name in ("mean", "std"))
@@ -117,7 +137,7 @@ def usual_range(measured: Sequence[Confidence], *, quantile: float = 0.99) -> di
     if not measured:
         raise ValueError("the usual range needs measured pairs, got none")
     usual = {}
-    for name, high_is_odd, _ in _MEANINGS:
+    for name, high_is_odd, *_ in _MEANINGS:
         values = [value for value in (asdict(one)[name] for one in measured) if value is not None]
         if values:
             numbers = torch.tensor(values, dtype=torch.float64)

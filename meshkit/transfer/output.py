@@ -9,6 +9,7 @@ from torch import Tensor
 
 from meshkit.batching import center
 from meshkit.io import atomic_write
+from meshkit.io.report import counted
 from meshkit.transfer.report import TransferResult
 from meshkit.viz import contact_sheet, render, save_html
 
@@ -37,8 +38,9 @@ def save_picture(path: str | os.PathLike[str], results: Sequence[TransferResult]
         bounds = torch.stack([everything.amin(0), everything.amax(0)])
         rows.append([render(verts, faces, bounds=bounds, size=(size, size)) for verts, faces in views])
         report = result.report
-        unusual = f"{len(report.warnings)} unusual numbers: see the report" if report.warnings else ""
-        captions.append([Path(report.identity.name).name, Path(report.pose.name).name, unusual])
+        count = len(report.warnings)
+        warned = f"{counted(count, 'warning')}: see the report" if count else ""
+        captions.append([Path(report.identity.name).name, Path(report.pose.name).name, warned])
     with atomic_write(path) as temporary:
         contact_sheet(rows, column_titles=_TITLES, captions=captions).save(temporary)
 

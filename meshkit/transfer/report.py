@@ -19,7 +19,7 @@ class TransferReport:
         pose: the pose mesh likewise.
         weights: which, and why.
         confidence: numbers that tell an ordinary transfer from an unusual one.
-        warnings: what is unusual, in words; empty if nothing is.
+        warnings: what is unusual or in doubt, in words; empty if nothing is.
         calibrated: whether the weights' card says what is usual; otherwise there are no warnings from the numbers.
         refined: weight of the network's result in the refinement; ``None`` if there was none.
         seconds: time taken.

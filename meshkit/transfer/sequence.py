@@ -17,7 +17,7 @@ from meshkit.io._binary_readers import read_scene
 from meshkit.transfer._choose import Weights
 from meshkit.transfer._frames import find_rotation, turns_about
 from meshkit.transfer._kinds import rest_body
-from meshkit.transfer._prepare import Mesh, Prepared, named, read
+from meshkit.transfer._prepare import Mesh, Prepared, examine, named, read
 from meshkit.transfer.report import TransferResult
 from meshkit.transfer.transfer import PoseTransfer
 
@@ -180,11 +180,12 @@ def transfer_sequence(
     follower: _Follower | None = None
     for number, mesh in enumerate(meshes):
         start = time.perf_counter()
-        name, verts, faces, _ = read(mesh, f"pose {number}")
+        name, verts, faces, notes = read(mesh, f"pose {number}")
         if follower is not None and before is not None and follower.fits(verts, faces):
             current = follower.follow(transfer, name, verts, before)
         else:
-            current = transfer.prepare_pose((verts, faces), name, unit=pose_unit, up=pose_up, facing=pose_facing)
+            opened = examine(name, verts, faces, notes)
+            current = transfer.prepare(opened, unit=pose_unit, up=pose_up, facing=pose_facing)
             follower = _Follower(current, verts, turns=pose_up is None or pose_facing is None)
         first = first or current
         before = current
@@ -211,6 +212,7 @@ class _Follower:
         clean = replace(first.clean, verts=scaled[first.clean.source.to(scaled.device)], original=scaled)
         small = clean.verts if first.simple.method == "none" else self._binding.carry(clean.verts)
         simple = replace(first.simple, verts=small, original=clean.verts)
+        descriptors = named(name, lambda: transfer.net.describe(small, simple.faces))
         rotation = before.rotation
         if self._turns and transfer.kind is not None and hasattr(transfer.net.generator, "match"):
             rotation, _ = named(
@@ -219,9 +221,11 @@ class _Follower:
                     transfer.net,
                     small,
                     simple.faces,
+                    descriptors=descriptors,
                     reference=rest_body(transfer.kind or ""),
                     candidates=turns_about(before.rotation),
                     usual=before.rotation[None],
                 ),
             )
-        return replace(first, name=name, clean=clean, simple=simple, rotation=rotation.to(small))
+        rotation = rotation.to(small)
+        return replace(first, name=name, clean=clean, simple=simple, descriptors=descriptors, rotation=rotation)

@@ -1,17 +1,18 @@
 """Pose transfer between any two meshes."""
 
 import time
+from functools import cache
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from meshkit.deform import arap_deform
+from meshkit.models import GeneratorOutput, PretrainedTransfer
 from meshkit.transfer._choose import Weights, choose_weights
 from meshkit.transfer._frames import axis_name, turn_up
-from meshkit.transfer._kinds import guess_kind
-from meshkit.transfer._prepare import Mesh, Prepared, named, prepare
-from meshkit.transfer.confidence import measure_confidence
+from meshkit.transfer._prepare import Mesh, OpenedMesh, Prepared, named, open_mesh, prepare
+from meshkit.transfer.confidence import Confidence, measure_confidence
 from meshkit.transfer.report import TransferReport, TransferResult
 
 __all__ = ["PoseTransfer", "transfer_pose"]
@@ -74,15 +75,15 @@ class PoseTransfer:
             raise ValueError(f"refine must be True, False or a positive weight, got {refine!r}")
         self.frame = frame
         self.refine = REFINE if refine is True else None if refine is False else float(refine)
-        self.net, self.weights = choose_weights(weights, identity, device=device)
+        opened = cache(lambda: open_mesh(identity, "identity"))
+        self.net, self.weights, self._doubts = choose_weights(weights, opened, device=device)
         self.kind: str | None = self.net.card.get("data")
-        self._num_verts = self.net.card.get("vertices") or _VERTICES.get(self.kind or "", 1000)
-        self.identity = self._prepare(identity, "identity", identity_unit, identity_up, identity_facing)
+        self.identity = self.prepare(opened(), unit=identity_unit, up=identity_up, facing=identity_facing)
 
-    def _prepare(self, mesh: Mesh, role: str, unit: str | None, up: str | None, facing: str | None) -> Prepared:
-        return prepare(
-            mesh, role, net=self.net, kind=self.kind, num_verts=self._num_verts, unit=unit, up=up, facing=facing
-        )
+    def prepare(self, opened: OpenedMesh, *, unit: str | None, up: str | None, facing: str | None) -> Prepared:
+        """Make a mesh ready for the weights: an identity mesh, or a pose mesh for :meth:`apply`."""
+        num_verts = self.net.card.get("vertices") or _VERTICES.get(self.kind or "", 1000)
+        return prepare(opened, net=self.net, kind=self.kind, num_verts=num_verts, unit=unit, up=up, facing=facing)
 
     @torch.no_grad()
     def __call__(
@@ -95,11 +96,8 @@ class PoseTransfer:
             ValueError: an unknown option, or a mesh that cannot be used.
         """
         start = time.perf_counter()
-        return self.apply(self.prepare_pose(pose, "pose", unit=pose_unit, up=pose_up, facing=pose_facing), start)
-
-    def prepare_pose(self, pose: Mesh, name: str, *, unit: str | None, up: str | None, facing: str | None) -> Prepared:
-        """Make a pose mesh ready, for :meth:`apply`."""
-        return self._prepare(pose, name, unit, up, facing)
+        opened = open_mesh(pose, "pose")
+        return self.apply(self.prepare(opened, unit=pose_unit, up=pose_up, facing=pose_facing), start)
 
     @torch.no_grad()
     def apply(self, other: Prepared, start: float, *, up: Tensor | None = None) -> TransferResult:
@@ -111,9 +109,7 @@ class PoseTransfer:
             up: up axis of the pose file; that of the body if ``None``.
         """
         own, net = self.identity, self.net
-        sides = {"identity_faces": own.simple.faces, "pose_faces": other.simple.faces}
-        output = named(f"{own.name}, {other.name}", lambda: net.output(own.verts, other.verts, **sides))
-        numbers = measure_confidence(net, own.verts, other.verts, **sides, output=output)
+        output, numbers = named(f"{own.name}, {other.name}", lambda: run_network(net, own, other))
         small = output.vertices
         if not bool(torch.isfinite(small).all()):
             raise ValueError(f"{other.name}: the network's result is not finite; the weights cannot do this pair")
@@ -121,15 +117,13 @@ class PoseTransfer:
             small = _refined(own.verts, own.simple.faces, small, self.refine)
         posed = own.carry(small)
         usual = net.card.get("usual", {})
-        warnings = numbers.warnings(usual)
-        if warnings:  # only then, as it costs a spectrum of each mesh
-            warnings = (*self._strangers(other), *warnings)
+        doubts = (*self._doubts, *self._strangers(other), *own.doubts, *other.doubts)
         report = TransferReport(
             own,
             other,
             self.weights,
             numbers,
-            warnings,
+            (*doubts, *numbers.warnings(usual)),
             bool(usual),
             self.refine,
             time.perf_counter() - start,
@@ -147,7 +141,7 @@ class PoseTransfer:
         """Which of the two meshes are clearly of another kind than the weights."""
         found = []
         for role, mesh in (("identity", self.identity), ("pose", other)) if self.kind else ():
-            kind, clear = guess_kind(mesh.simple.verts, mesh.simple.faces)
+            kind, clear = mesh.likeness
             if clear and kind != self.kind:
                 found.append(f"these weights are for {self.kind}, but the {role} mesh has the shape of {kind}")
         return tuple(found)
@@ -171,6 +165,16 @@ class PoseTransfer:
             return in_pose_axes / other.scale.metres
         turn = turn_up(up.cpu(), own.up.cpu()).to(posed)
         return in_pose_axes @ turn.T / own.scale.metres
+
+
+def run_network(net: PretrainedTransfer, identity: Prepared, pose: Prepared) -> tuple[GeneratorOutput, Confidence]:
+    """What the weights make of two prepared meshes, and the numbers of it."""
+    pair = identity.verts, pose.verts
+    faces = {"identity_faces": identity.simple.faces, "pose_faces": pose.simple.faces}
+    one, two = identity.descriptors, pose.descriptors
+    output = net.output(*pair, **faces, identity_descriptors=one, pose_descriptors=two)
+    numbers = measure_confidence(net, *pair, **faces, output=output, identity_descriptors=one, pose_descriptors=two)
+    return output, numbers
 
 
 def _standing_point(verts: Tensor) -> Tensor:
