@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from pathlib import Path
+from statistics import mean, stdev
 from typing import Any
 
 from _tables_sheets import NOISE_PAIRS, TOPOLOGY_PAIRS
@@ -25,6 +26,8 @@ TITLES = {
     "ablation": "Table 3, parts of X-DualNet, humans",
     "humans-6890": "Humans at 6890 vertices, bare networks, {large_pairs} pairs; trained at 1000 vertices, one seed",
 }
+ABLATIONS = ("norms", "ablation")
+"""Tables whose last row is the whole method."""
 
 SHEETS = {
     "comparison-humans": "Comparison, humans, first seed",
@@ -47,14 +50,16 @@ class Row:
     figures: dict[str, tuple[float, float]]
     runs: int
     paper: dict[str, float]
+    by_seed: dict[int, float] = field(default_factory=dict)
+    """PMD of each run."""
 
 
 def shown(figure: tuple[float, float] | None) -> str:
     """``mean ± spread``; the mean alone of a single run."""
     if figure is None:
         return "-"
-    mean, spread = figure
-    return f"{mean:.2f}" if math.isnan(spread) else f"{mean:.2f} ± {spread:.2f}"
+    value, spread = figure
+    return f"{value:.2f}" if math.isnan(spread) else f"{value:.2f} ± {spread:.2f}"
 
 
 def table(rows: list[Row], heads: dict[str, str]) -> str:
@@ -91,6 +96,23 @@ def order(rows: list[Row]) -> str:
     }
     legend = "; ".join(f"`{sign}`: {meaning}" for sign, meaning in meanings.items() if sign in signs)
     return f"PMD here: {text}. Paper: {paper}. Here {legend}.\n"
+
+
+def paired(rows: list[Row]) -> str:
+    """How the PMD of each ablation differs from the whole method's, the last row, in runs of one seed.
+
+    Runs of one seed see the same pairs and, but for what is left out, begin with the same parameters; what a seed does
+    to both falls out of their difference.
+    """
+    *parts, whole = rows
+    said = []
+    for row in parts:
+        seeds = sorted(row.by_seed.keys() & whole.by_seed.keys())
+        if len(seeds) > 1:
+            changes = [row.by_seed[seed] - whole.by_seed[seed] for seed in seeds]
+            each = ", ".join(f"{change:+.2f}" for change in changes)
+            said.append(f"{row.title} {mean(changes):+.2f} ± {stdev(changes):.2f} ({each})")
+    return f"PMD less that of {whole.title} with the same seed and pairs: {'; '.join(said)}.\n" if said else ""
 
 
 def plain(title: str, said: str, heads: list[str], rows: list[list[Any]]) -> str:
@@ -206,6 +228,7 @@ def write_tables(
     for name, rows in tables.items():
         heads = HEADS if name.endswith("animals") else HEADS_OF_HUMANS
         parts += [f"## {TITLES[name].format(large_pairs=cfg.large_pairs)}\n", table(rows, heads), order(rows)]
+        parts += [paired(rows)] if name in ABLATIONS else []
         write_csv(to / f"{name}.csv", rows)
     parts += measured_once(extra, paper_seconds, f"`{made_by}`") if extra else []
     parts += [f"## {title}\n\n![{title}]({name}.png)\n" for name, title in SHEETS.items() if name in drawn]

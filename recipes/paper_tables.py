@@ -103,7 +103,9 @@ def row(title: str, names: list[str], kind: str, cfg: Config, vertices: int | No
         for metric, values in figures(name, kind, vertices, count, cfg).items():
             means[metric].append(METRICS[metric] * sum(values) / len(values))
     printed = dict(zip(METRICS, paper, strict=False))
-    return Row(title, {m: summary(v) for m, v in means.items() if v}, len(names), printed)
+    seeds = [int(name.rpartition("-")[2]) for name in names if name.rpartition("-")[2].isdigit()]
+    by_seed = dict(zip(seeds, means["pmd"], strict=True)) if seeds else {}
+    return Row(title, {m: summary(v) for m, v in means.items() if v}, len(names), printed, by_seed)
 
 
 def summary(values: list[float]) -> tuple[float, float]:

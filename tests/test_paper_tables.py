@@ -242,6 +242,21 @@ def test_the_order_of_methods_says_where_spreads_overlap() -> None:
     assert "`?`: a single run" in said and "`<`" not in said and "`~`" not in said, "signs that are used are explained"
 
 
+def test_ablations_are_compared_seed_by_seed() -> None:
+    write = recipe_module("_tables_write")
+
+    def row(title: str, **by_seed: float) -> Any:
+        return write.Row(title, {"pmd": (0.0, 0.0)}, len(by_seed), {}, {int(k[1:]): v for k, v in by_seed.items()})
+
+    whole = row("whole", s0=8.0, s1=11.0, s2=7.0)
+    said = write.paired([row("without a", s0=7.5, s1=10.7, s2=6.9), row("without b", s0=9.0, s2=9.0), whole])
+    assert said == (
+        "PMD less that of whole with the same seed and pairs: without a -0.30 ± 0.20 (-0.50, -0.30, -0.10); "
+        "without b +1.50 ± 0.71 (+1.00, +2.00).\n"
+    )
+    assert write.paired([row("without a", s0=7.5), whole]) == "", "one pair of runs has no spread"
+
+
 def test_sheets_are_drawn_of_what_there_is(config: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     sheets, train = recipe_module("_tables_sheets"), recipe_module("_tables_train")
     monkeypatch.setattr(sheets, "NOISE", (0.0, 5.0))
