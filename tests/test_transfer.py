@@ -301,6 +301,23 @@ def test_a_pose_mesh_of_the_other_kind_is_told(person):
     assert transfer_pose(person, person, weights=net, **UPRIGHT).report.warnings == ()
 
 
+def test_the_kind_is_looked_at_once_and_where_it_counts(person, monkeypatch):
+    looked = []
+
+    def look(verts, _):
+        looked.append(len(verts))
+        return "humans", True
+
+    monkeypatch.setattr("meshkit.transfer._prepare.guess_kind", look)
+    monkeypatch.setattr(choose, "pretrained_names", lambda: ["a"])
+    monkeypatch.setattr(choose, "load_pretrained", lambda _: copier(name="a", data="humans", figures={"pmd": 1.0}))
+    transfer_pose(person, person, **UPRIGHT)
+    assert len(looked) == 2, "the identity, to choose by it and to check it, and the pose mesh"
+    looked.clear()
+    transfer_pose(person, person, weights=copier(), **UPRIGHT)
+    assert not looked, "weights that do not say what they are for"
+
+
 def test_doubt_of_size_and_axes_is_a_warning(person, monkeypatch):
     net = copier(data="humans", usual=WIDE)
     odd = (3 * person[0], person[1])

@@ -77,7 +77,8 @@ class Prepared:
         scale: how its lengths became metres.
         rotation: (3, 3) takes the file's axes to those of the weights.
         found: how ``rotation`` came about.
-        likeness: ``"humans"`` or ``"animals"``, whichever it is more like, and whether that is clear.
+        likeness: ``"humans"`` or ``"animals"``, whichever it is more like, and whether that is clear; ``None`` if the
+            weights do not say what they are for.
         doubts: what may be wrong with it, in words.
         notes: what was done or should be known.
     """
@@ -91,7 +92,7 @@ class Prepared:
     scale: Scale
     rotation: Tensor
     found: str
-    likeness: tuple[str, bool]
+    likeness: tuple[str, bool] | None
     doubts: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -218,7 +219,10 @@ def prepare(
     if not clear:
         axes = f"up {axis_name(rotation[2])}, facing {axis_name(-rotation[1])}"
         doubts += (f"{name}: axes in doubt ({axes}): give them if they are wrong",)
-    likeness = named(name, lambda: guess_kind(simple.verts, simple.faces))
+    likeness = None
+    if kind is not None:  # it costs a spectrum, which the choice of the weights may have paid already
+        own = num_verts != _LOOKED_AT
+        likeness = named(name, lambda: guess_kind(simple.verts, simple.faces)) if own else opened.likeness
     rotation = rotation.to(metric.verts)
     return Prepared(
         name, opened.faces, report, metric, simple, descriptors, scale, rotation, found, likeness, doubts, notes
