@@ -519,6 +519,18 @@ def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
     assert all("pose mesh has the shape of animals" in result.report.warnings[1] for result in results)
 
 
+def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatch):
+    net = copier(data="humans", usual=WIDE)
+    net.generator.match = None  # find_rotation, which would call it, is replaced
+    monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, **__: (torch.eye(3), 0.2))
+    leads = iter((0.01, 0.2))
+    monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), next(leads)))
+    axes = {name: axis for name, axis in UPRIGHT.items() if name != "pose_facing"}
+    results = transfer_sequence(person, [(v, moves[1]) for v in moves[0]], weights=net, **axes)
+    said = "pose 1: axes in doubt (up +z, facing -y): give them if they are wrong"
+    assert [result.report.warnings for result in results] == [(), (said,), ()]
+
+
 def test_what_the_reader_says_of_the_first_pose_is_kept(person, moves, tmp_path):
     (a, b, c), *others = (moves[1] + 1).tolist()
     beside = next(face for face in others if {a, b} < set(face))

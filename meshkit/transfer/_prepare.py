@@ -17,7 +17,7 @@ from meshkit.models import PretrainedTransfer
 from meshkit.transfer._frames import DOUBT, UNITS, Scale, axis_name, find_rotation, find_scale, rotations
 from meshkit.transfer._kinds import guess_kind, rest_body
 
-__all__ = ["Mesh", "OpenedMesh", "Prepared", "examine", "named", "open_mesh", "prepare", "read"]
+__all__ = ["Mesh", "OpenedMesh", "Prepared", "axes_doubt", "examine", "named", "open_mesh", "prepare", "read"]
 
 T = TypeVar("T")
 Mesh = str | os.PathLike[str] | tuple[Tensor, Tensor]
@@ -217,8 +217,7 @@ def prepare(
     rotation, found, clear = named(name, lambda: _rotation(report, simple, descriptors, net, kind, up, facing))
     doubts: tuple[str, ...] = (f"{name}: {scale.doubt}",) if scale.doubt else ()
     if not clear:
-        axes = f"up {axis_name(rotation[2])}, facing {axis_name(-rotation[1])}"
-        doubts += (f"{name}: axes in doubt ({axes}): give them if they are wrong",)
+        doubts += (axes_doubt(name, rotation),)
     likeness = None
     if kind is not None:  # it costs a spectrum, which the choice of the weights may have paid already
         own = num_verts != _LOOKED_AT
@@ -227,6 +226,12 @@ def prepare(
     return Prepared(
         name, opened.faces, report, metric, simple, descriptors, scale, rotation, found, likeness, doubts, notes
     )
+
+
+def axes_doubt(name: str, rotation: Tensor) -> str:
+    """What is said of axes that are not clear."""
+    axes = f"up {axis_name(rotation[2])}, facing {axis_name(-rotation[1])}"
+    return f"{name}: axes in doubt ({axes}): give them if they are wrong"
 
 
 def _rotation(
