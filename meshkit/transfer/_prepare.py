@@ -218,7 +218,7 @@ def prepare(
     doubts: tuple[str, ...] = (f"{name}: {scale.doubt}",) if scale.doubt else ()
     if not clear:
         doubts += (axes_doubt(name, rotation),)
-    likeness = None
+    likeness: tuple[str, bool] | None = None
     if kind is not None:  # it costs a spectrum, which the choice of the weights may have paid already
         own = num_verts != _LOOKED_AT
         likeness = named(name, lambda: guess_kind(simple.verts, simple.faces)) if own else opened.likeness
