@@ -2,9 +2,9 @@
 
     python benchmarks/transfer.py xdualnet-humans --pairs 40
 
-Fixed test pairs 200 and on (the first are what the weights' usual range was measured on), the identity mesh of one
-resolution and the pose mesh of another where there are several, each turned to one of the 24 orientations along the
-axes at random, and the pose mesh in centimetres. PMD in 1e-3 square metres, edge ratio against the truth.
+Fixed test pairs 200 and on, the identity mesh of one resolution and the pose mesh of another where there are several,
+each turned to one of the 24 orientations along the axes at random, and the pose mesh in centimetres. PMD in 1e-3 square
+metres, edge ratio against the truth.
 """
 
 import argparse

@@ -262,6 +262,11 @@ def test_sampled_identities_join_the_training_ones_alone(run: Any, without_repor
     assert torch.equal(again.identities, body.identities)
 
 
+def test_fewer_than_no_sampled_identities_are_refused(run: Any) -> None:
+    with pytest.raises(recipe_module("_run").UserError, match="--sampled-identities must not be negative, got -3"):
+        run("corenet3d", "--sampled-identities", -3, "--steps", 1)
+
+
 def test_sampled_identities_need_a_rig(run: Any, tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
     with pytest.raises(recipe_module("_run").UserError, match="--sampled-identities needs a rig"):

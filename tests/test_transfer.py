@@ -301,6 +301,23 @@ def test_a_pose_mesh_of_the_other_kind_is_told(person):
     assert transfer_pose(person, person, weights=net, **UPRIGHT).report.warnings == ()
 
 
+def test_the_kind_is_looked_at_once_and_where_it_counts(person, monkeypatch):
+    looked = []
+
+    def look(verts, _):
+        looked.append(len(verts))
+        return "humans", True
+
+    monkeypatch.setattr("meshkit.transfer._prepare.guess_kind", look)
+    monkeypatch.setattr(choose, "pretrained_names", lambda: ["a"])
+    monkeypatch.setattr(choose, "load_pretrained", lambda _: copier(name="a", data="humans", figures={"pmd": 1.0}))
+    transfer_pose(person, person, **UPRIGHT)
+    assert len(looked) == 2, "the identity, to choose by it and to check it, and the pose mesh"
+    looked.clear()
+    transfer_pose(person, person, weights=copier(), **UPRIGHT)
+    assert not looked, "weights that do not say what they are for"
+
+
 def test_doubt_of_size_and_axes_is_a_warning(person, monkeypatch):
     net = copier(data="humans", usual=WIDE)
     odd = (3 * person[0], person[1])
@@ -500,6 +517,18 @@ def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
     results = list(transfer_sequence(person, poses, weights=copier(data="humans"), **UPRIGHT))
     assert len(looked) == 2  # the identity and the first pose
     assert all("pose mesh has the shape of animals" in result.report.warnings[1] for result in results)
+
+
+def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatch):
+    net = copier(data="humans", usual=WIDE)
+    net.generator.match = None  # find_rotation, which would call it, is replaced
+    monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, **__: (torch.eye(3), 0.2))
+    leads = iter((0.01, 0.2))
+    monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), next(leads)))
+    axes = {name: axis for name, axis in UPRIGHT.items() if name != "pose_facing"}
+    results = transfer_sequence(person, [(v, moves[1]) for v in moves[0]], weights=net, **axes)
+    said = "pose 1: axes in doubt (up +z, facing -y): give them if they are wrong"
+    assert [result.report.warnings for result in results] == [(), (said,), ()]
 
 
 def test_what_the_reader_says_of_the_first_pose_is_kept(person, moves, tmp_path):

@@ -239,7 +239,7 @@ def sample_identities(
         identities: ``(I, K)`` shape coefficients, at least two rows.
         count: how many.
         spread: factor s on the standard deviations. At 1 a few animals in a hundred turn inside out somewhere.
-        generator: of the numbers z.
+        generator: of the numbers z, which are drawn on its device; on the CPU if ``None``.
 
     Returns:
         ``(count, K)``.
@@ -257,7 +257,8 @@ def sample_identities(
     if identities.dim() != 2 or len(identities) < 2:
         raise ValueError(f"a table of at least two rows (I, K) is needed, got {tuple(identities.shape)}")
     mean = identities.mean(0)
-    z = torch.randn(count, len(identities), generator=generator, dtype=identities.dtype).to(identities)
+    device = "cpu" if generator is None else generator.device
+    z = torch.randn(count, len(identities), generator=generator, device=device, dtype=identities.dtype).to(identities)
     return mean + spread * (z @ (identities - mean)) / (len(identities) - 1) ** 0.5
 
 

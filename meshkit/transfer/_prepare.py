@@ -17,7 +17,7 @@ from meshkit.models import PretrainedTransfer
 from meshkit.transfer._frames import DOUBT, UNITS, Scale, axis_name, find_rotation, find_scale, rotations
 from meshkit.transfer._kinds import guess_kind, rest_body
 
-__all__ = ["Mesh", "OpenedMesh", "Prepared", "examine", "named", "open_mesh", "prepare", "read"]
+__all__ = ["Mesh", "OpenedMesh", "Prepared", "axes_doubt", "examine", "named", "open_mesh", "prepare", "read"]
 
 T = TypeVar("T")
 Mesh = str | os.PathLike[str] | tuple[Tensor, Tensor]
@@ -77,7 +77,8 @@ class Prepared:
         scale: how its lengths became metres.
         rotation: (3, 3) takes the file's axes to those of the weights.
         found: how ``rotation`` came about.
-        likeness: ``"humans"`` or ``"animals"``, whichever it is more like, and whether that is clear.
+        likeness: ``"humans"`` or ``"animals"``, whichever it is more like, and whether that is clear; ``None`` if the
+            weights do not say what they are for.
         doubts: what may be wrong with it, in words.
         notes: what was done or should be known.
     """
@@ -91,7 +92,7 @@ class Prepared:
     scale: Scale
     rotation: Tensor
     found: str
-    likeness: tuple[str, bool]
+    likeness: tuple[str, bool] | None
     doubts: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -216,13 +217,21 @@ def prepare(
     rotation, found, clear = named(name, lambda: _rotation(report, simple, descriptors, net, kind, up, facing))
     doubts: tuple[str, ...] = (f"{name}: {scale.doubt}",) if scale.doubt else ()
     if not clear:
-        axes = f"up {axis_name(rotation[2])}, facing {axis_name(-rotation[1])}"
-        doubts += (f"{name}: axes in doubt ({axes}): give them if they are wrong",)
-    likeness = named(name, lambda: guess_kind(simple.verts, simple.faces))
+        doubts += (axes_doubt(name, rotation),)
+    likeness: tuple[str, bool] | None = None
+    if kind is not None:  # it costs a spectrum, which the choice of the weights may have paid already
+        own = num_verts != _LOOKED_AT
+        likeness = named(name, lambda: guess_kind(simple.verts, simple.faces)) if own else opened.likeness
     rotation = rotation.to(metric.verts)
     return Prepared(
         name, opened.faces, report, metric, simple, descriptors, scale, rotation, found, likeness, doubts, notes
     )
+
+
+def axes_doubt(name: str, rotation: Tensor) -> str:
+    """What is said of axes that are not clear."""
+    axes = f"up {axis_name(rotation[2])}, facing {axis_name(-rotation[1])}"
+    return f"{name}: axes in doubt ({axes}): give them if they are wrong"
 
 
 def _rotation(

@@ -15,9 +15,9 @@ from torch import Tensor
 from meshkit.io import MeshFileError, SurfaceBinding
 from meshkit.io._binary_readers import read_scene
 from meshkit.transfer._choose import Weights
-from meshkit.transfer._frames import find_rotation, turns_about
+from meshkit.transfer._frames import DOUBT, find_rotation, turns_about
 from meshkit.transfer._kinds import rest_body
-from meshkit.transfer._prepare import Mesh, Prepared, examine, named, read
+from meshkit.transfer._prepare import Mesh, Prepared, axes_doubt, examine, named, read
 from meshkit.transfer.report import TransferResult
 from meshkit.transfer.transfer import PoseTransfer
 
@@ -213,9 +213,9 @@ class _Follower:
         small = clean.verts if first.simple.method == "none" else self._binding.carry(clean.verts)
         simple = replace(first.simple, verts=small, original=clean.verts)
         descriptors = named(name, lambda: transfer.net.describe(small, simple.faces))
-        rotation = before.rotation
+        rotation, doubts = before.rotation, first.doubts
         if self._turns and transfer.kind is not None and hasattr(transfer.net.generator, "match"):
-            rotation, _ = named(
+            rotation, lead = named(
                 name,
                 lambda: find_rotation(
                     transfer.net,
@@ -227,5 +227,7 @@ class _Follower:
                     usual=before.rotation[None],
                 ),
             )
-        rotation = rotation.to(small)
-        return replace(first, name=name, clean=clean, simple=simple, descriptors=descriptors, rotation=rotation)
+            if lead <= DOUBT:
+                doubts += (axes_doubt(name, rotation),)
+        current = replace(first, name=name, clean=clean, simple=simple, descriptors=descriptors, doubts=doubts)
+        return replace(current, rotation=rotation.to(small))

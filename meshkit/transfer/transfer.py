@@ -140,8 +140,8 @@ class PoseTransfer:
     def _strangers(self, other: Prepared) -> tuple[str, ...]:
         """Which of the two meshes are clearly of another kind than the weights."""
         found = []
-        for role, mesh in (("identity", self.identity), ("pose", other)) if self.kind else ():
-            kind, clear = mesh.likeness
+        for role, mesh in (("identity", self.identity), ("pose", other)):
+            kind, clear = mesh.likeness or (self.kind, False)
             if clear and kind != self.kind:
                 found.append(f"these weights are for {self.kind}, but the {role} mesh has the shape of {kind}")
         return tuple(found)
