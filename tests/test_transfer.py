@@ -39,7 +39,7 @@ from meshkit.transfer import (
 from meshkit.transfer._frames import axis_name, axis_vector, find_scale, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import guess_kind
 from meshkit.transfer._prepare import named, open_mesh
-from meshkit.transfer.command import main
+from meshkit.transfer.command import main, parser
 from meshkit.transfer.confidence import row_entropies
 
 UPRIGHT = {"identity_up": "+z", "identity_facing": "-y", "pose_up": "+z", "pose_facing": "-y"}
@@ -630,6 +630,24 @@ def test_any_kind_of_value_error_gets_the_meshs_name():
 
 def _raise(error: Exception) -> None:
     raise error
+
+
+def test_an_axis_with_a_minus_may_stand_alone():
+    words = ["a.obj", "b.obj", "--pose-facing", "-y", "--identity-up", "-z", "--pose-up=+x"]
+    args = parser().parse_args(words)
+    assert (args.pose_facing, args.identity_up, args.pose_up) == ("-y", "-z", "+x")
+    with pytest.raises(SystemExit):
+        parser().parse_args([*words, "-y"])
+
+
+def test_reports_say_how_good_the_weights_are(person, mover):
+    figures = {"pmd": 9.17, "pmd_copy_identity": 20.4}
+    text = str(transfer_pose(person, mover, weights=copier(usual=WIDE, figures=figures), **UPRIGHT).report)
+    assert "PMD on unseen test pairs is 9.2e-3, where leaving the identity as it is has 20.4e-3; they are poor" in text
+    good = copier(usual=WIDE, figures={"pmd": 1.1, "pmd_copy_identity": 55.3})
+    text = str(transfer_pose(person, mover, weights=good, **UPRIGHT).report)
+    assert "is 1.1e-3" in text and "poor" not in text
+    assert "PMD" not in str(transfer_pose(person, mover, weights=copier(usual=WIDE), **UPRIGHT).report)
 
 
 def test_a_misspelt_option_is_told_last_with_the_nearest(capsys):

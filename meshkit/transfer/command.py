@@ -34,6 +34,16 @@ class _Parser(argparse.ArgumentParser):
             message += f"; did you mean {near[0]}?" if near else ""
         super().error(message)
 
+    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
+        """Takes ``--pose-facing -y`` as well as ``--pose-facing=-y``: an axis is no option."""
+        words: list[str] = []
+        for word in sys.argv[1:] if args is None else args:
+            if words and word in ("-x", "-y", "-z") and words[-1].endswith(("-up", "-facing")):
+                words[-1] += f"={word}"
+            else:
+                words.append(word)
+        return super().parse_known_args(words, namespace)
+
 
 def parser() -> argparse.ArgumentParser:
     """What the command takes."""
@@ -43,8 +53,7 @@ def parser() -> argparse.ArgumentParser:
         description="Give the body of IDENTITY the pose of POSE: any two meshes (obj, ply, off, stl, glb). POSE may "
         "also be a folder of meshes, an .npz file with verts (T, V, 3) and faces (F, 3), or a .glb file of several "
         "meshes with equal faces: then every pose is transferred, in order.",
-        epilog=f"Weights that come with this installation: {', '.join(pretrained_names()) or 'none'}. An axis that "
-        "begins with a minus sign is written with an equals sign: --pose-facing=-y.",
+        epilog=f"Weights that come with this installation: {', '.join(pretrained_names()) or 'none'}.",
     )
     made.add_argument("identity", type=Path, help="mesh that gives the body")
     made.add_argument("pose", type=Path, help="mesh, or many, that give the pose")

@@ -24,6 +24,8 @@ class TransferReport:
         refined: weight of the network's result in the refinement; ``None`` if there was none.
         seconds: time taken.
         frame: axes and unit of the result, in words.
+        quality: mean error of the weights on unseen test pairs, in words; empty if their card does not say. That a
+            transfer is usual says no more than that it is as good as these.
     """
 
     identity: Prepared
@@ -35,6 +37,7 @@ class TransferReport:
     refined: float | None
     seconds: float
     frame: str = ""
+    quality: str = ""
 
     def __str__(self) -> str:
         numbers = self.confidence
@@ -44,6 +47,7 @@ class TransferReport:
             facts.append(f"{numbers.mutual_share:.0%} of them mutual")
         lines = [f"identity {self.identity.name}", _indented(str(self.identity))]
         lines += [f"pose     {self.pose.name}", _indented(str(self.pose)), f"weights  {self.weights}"]
+        lines += [f"         {self.quality}"] if self.quality else []
         lines.append(f"result   {', '.join(facts)}; {self.seconds:.1f} s")
         if self.frame:
             lines.append(f"         {self.frame}")
