@@ -113,7 +113,7 @@ def parse(presets: dict[str, S], description: str | None) -> S:
     """Read the command line against the chosen preset's values; of two presets the last counts."""
     words = sys.argv[1:]
     chosen = "tiny"
-    for word, value in zip(words, [*words[1:], ""], strict=True):
+    for word, value in zip(words, [*words[1:], ""], strict=False):  # without words there is no pair
         flag, joined, own = word.partition("=")
         if flag == "--preset":
             chosen = own if joined else value

@@ -473,7 +473,8 @@ def test_deformer_gradient_reaches_the_handles_of_the_target_only() -> None:
 
 def test_deformer_options() -> None:
     assert repr(ARAPDeformer(0.2)) == (
-        "ARAPDeformer(fraction=0.2, energy='spokes_and_rims', method='lbfgs', max_iter=50, tol=1e-07, grad='implicit')"
+        "ARAPDeformer(fraction=0.2, energy='spokes_and_rims', degenerate='raise', generator=None, method='lbfgs', "
+        "max_iter=50, tol=1e-07, grad='implicit', grad_tol=0.001, solver='auto', compiled=False)"
     )
     for fraction in (0.0, 1.5, float("nan")):
         with pytest.raises(ValueError, match=r"fraction must be in \(0, 1\], got"):
