@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -113,7 +114,7 @@ def parse(presets: dict[str, S], description: str | None) -> S:
     """Read the command line against the chosen preset's values; of two presets the last counts."""
     words = sys.argv[1:]
     chosen = "tiny"
-    for word, value in zip(words, [*words[1:], ""], strict=False):  # without words there is no pair
+    for word, value in pairwise([*words, ""]):
         flag, joined, own = word.partition("=")
         if flag == "--preset":
             chosen = own if joined else value

@@ -103,8 +103,8 @@ def row(title: str, names: list[str], kind: str, cfg: Config, vertices: int | No
         for metric, values in figures(name, kind, vertices, count, cfg).items():
             means[metric].append(METRICS[metric] * sum(values) / len(values))
     printed = dict(zip(METRICS, paper, strict=False))
-    seeds = [int(name.rpartition("-")[2]) for name in names if name.rpartition("-")[2].isdigit()]
-    by_seed = dict(zip(seeds, means["pmd"], strict=True)) if seeds else {}
+    endings = [name.rpartition("-")[2] for name in names]  # the seed, of runs
+    by_seed = {int(seed): pmd for seed, pmd in zip(endings, means["pmd"], strict=True) if seed.isdigit()}
     return Row(title, {m: summary(v) for m, v in means.items() if v}, len(names), printed, by_seed)
 
 

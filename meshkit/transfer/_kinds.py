@@ -8,7 +8,7 @@ from torch import Tensor
 from meshkit.data import load_shipped
 from meshkit.descriptors import laplacian_eigenpairs
 
-__all__ = ["guess_kind", "kind_score", "rest_body", "shape_numbers"]
+__all__ = ["guess_kind", "kind_score", "rest_body", "shape_numbers", "surface_area"]
 
 # A linear discriminant of the shape numbers; tools/fit_kinds.py finds it.
 _WEIGHTS = (0.862, 0.777, 1.837, -0.125, -1.271, -0.365, -1.717, 1.272)
@@ -56,7 +56,13 @@ def shape_numbers(verts: Tensor, faces: Tensor) -> Tensor:
     triangles = faces.cpu()
     eigenvalues, _ = laplacian_eigenpairs(points, triangles, 16, method="fast")
     a, b, c = (points[triangles[:, k]] - points.mean(0) for k in range(3))
-    area = torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2
+    area = surface_area(points, triangles)
     volume = (a * torch.linalg.cross(b, c)).sum().abs() / 6
     tiny = torch.finfo(points.dtype).tiny
     return torch.cat([(volume ** (2 / 3) / area)[None], eigenvalues[1:8]]).clamp_min(tiny).log()
+
+
+def surface_area(verts: Tensor, faces: Tensor) -> Tensor:
+    """Area of a surface, in float64."""
+    a, b, c = (verts.double()[faces[:, k]] for k in range(3))
+    return torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2

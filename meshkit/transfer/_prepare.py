@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
 
-import torch
 from torch import Tensor
 
 from meshkit.io import CleanMesh, MeshFileError, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
 from meshkit.io.report import counted
 from meshkit.models import PretrainedTransfer
 from meshkit.transfer._frames import DOUBT, UNITS, Scale, axis_name, find_rotation, find_scale, rotations
-from meshkit.transfer._kinds import guess_kind, rest_body
+from meshkit.transfer._kinds import guess_kind, rest_body, surface_area
 
 __all__ = ["Mesh", "OpenedMesh", "Prepared", "axes_doubt", "examine", "named", "open_mesh", "prepare", "read"]
 
@@ -189,8 +188,9 @@ def prepare(
     name, report, clean, notes = opened.name, opened.report, opened.clean, opened.notes
     net_device = next(net.parameters()).device
     among = ("m", "cm", "mm") if kind == "animals" else tuple(UNITS)
-    area = _area(clean.verts, clean.faces)
-    scale = named(name, lambda: find_scale(area, _reference_area(kind), unit, among=among))
+    area = float(surface_area(clean.verts, clean.faces))
+    usual_area = float(surface_area(*rest_body(kind or "humans")))
+    scale = named(name, lambda: find_scale(area, usual_area, unit, among=among))
     scale = dataclasses.replace(scale, metric=kind != "animals")
 
     def scaled(verts: Tensor) -> Tensor:
@@ -218,10 +218,7 @@ def prepare(
     doubts: tuple[str, ...] = (f"{name}: {scale.doubt}",) if scale.doubt else ()
     if not clear:
         doubts += (axes_doubt(name, rotation),)
-    likeness: tuple[str, bool] | None = None
-    if kind is not None:  # it costs a spectrum, which the choice of the weights may have paid already
-        own = num_verts != _LOOKED_AT
-        likeness = named(name, lambda: guess_kind(simple.verts, simple.faces)) if own else opened.likeness
+    likeness = None if kind is None else opened.likeness  # it costs a spectrum
     rotation = rotation.to(metric.verts)
     return Prepared(
         name, opened.faces, report, metric, simple, descriptors, scale, rotation, found, likeness, doubts, notes
@@ -272,12 +269,3 @@ def named(name: str, make: Callable[[], T]) -> T:
         # Other kinds of ValueError, such as UnicodeDecodeError, cannot be made from a text.
         kind = MeshFileError if isinstance(error, MeshFileError) else ValueError
         raise kind(f"{name}: {error}") from error
-
-
-def _reference_area(kind: str | None) -> float:
-    return _area(*rest_body(kind or "humans"))
-
-
-def _area(verts: Tensor, faces: Tensor) -> float:
-    a, b, c = (verts.double()[faces[:, k]] for k in range(3))
-    return float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2)
