@@ -56,12 +56,15 @@ def check_mask(mask: Tensor | None, batch: int, num: int, *, name: str = "mask",
 
     Raises:
         ValueError: if the mask has another shape or dtype, or a sample without real vertices under ``nonempty``.
+        TypeError: if it is no tensor.
 
     Example:
         >>> check_mask(torch.tensor([[True, False]]), 1, 2, nonempty=True)
     """
     if mask is None:
         return
+    if not isinstance(mask, Tensor):
+        raise TypeError(f"{name} must be a bool tensor {(batch, num)} or None, got {type(mask).__name__}")
     if mask.dtype != torch.bool:
         raise ValueError(f"{name} must be bool (True = real vertex), got {mask.dtype}; convert it with .bool()")
     if mask.shape != (batch, num):

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import torch
-from _data import told
+from _data import IN_METRES, told
 from _run import UserError
 from torch import Tensor
 
@@ -18,8 +18,8 @@ from meshkit.io import MeshFileError, load_mesh, save_mesh
 from meshkit.models import GeneratorConfig, load_generator
 from meshkit.models.pretrained import check_extent
 
-IN_METRES = ("humans", "animals", "smpl", "smal", "faust")
-"""Kinds of --data whose bodies are in metres; meshes of other folders may be in any unit."""
+FROM_1_TO_2 = ("humans", "animals", "smpl", "smal", "faust")
+"""Kinds of --data whose bodies are about 1 to 2 long, in metres or units; meshes of folders may be of any size."""
 SELDOM_LONGEST = {"humans": "y", "smpl": "y", "animals": "xz", "smal": "xz"}
 """Axes along which the bodies of a kind are longest in few poses; a person's arms may reach farther than it is tall."""
 
@@ -32,7 +32,7 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
         kind = trained_on(folder)
         meshes = [load_mesh(path) for path in files]
         for path, (verts, _) in zip(files, meshes, strict=True):
-            if kind in IN_METRES:
+            if kind in FROM_1_TO_2:
                 other = shlex.join(["meshkit-transfer", *map(str, files), "--weights", str(folder)])
                 check_extent(float(extent(verts).max()), str(path), advice=f"`{other}` guesses unit and axes")
             if model.architecture == "matching" and model.extractor == "setconv" and len(verts) < model.k:
@@ -70,9 +70,10 @@ def warn(path: Path, verts: Tensor, kind: str) -> None:
     """Speak up where a mesh is unlike the bodies a model was trained on."""
     tallest = float(extent(verts).max())
     axis = "xyz"[int(extent(verts).argmax())]
-    if kind in IN_METRES and not 0.5 <= tallest <= 2.6:
+    if kind in FROM_1_TO_2 and not 0.5 <= tallest <= 2.6:
+        unit = " metres" if kind in IN_METRES else ""
         print(
-            f"warning: {path} is {tallest:.3g} long; weights trained on bodies in metres expect about 1 to 2",
+            f"warning: {path} is {tallest:.3g} long; these weights were trained on bodies of about 1 to 2{unit}",
             file=sys.stderr,
         )
     if axis in SELDOM_LONGEST.get(kind, ""):

@@ -36,6 +36,13 @@ from meshkit.models import NPT
 KINDS = "humans, animals, smpl:<file>, smal:<file>, faust:<folder>, mgn:<folder> or folder:<folder>"
 SCANNERS = {"faust": scan_faust, "mgn": scan_mgn, "folder": scan_pose_transfer}
 Pairs = PosePairs | MeshPairs
+IN_METRES = ("humans", "smpl", "faust", "mgn")
+"""Kinds of --data whose bodies are in metres; the animals' unit is arbitrary, that of other folders unknown."""
+
+
+def unit_of(kind: str) -> str:
+    """The unit of lengths in reports: ``m``, or ``units``."""
+    return "m" if kind.partition(":")[0] in IN_METRES else "units"
 
 
 def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -> tuple[Pairs, Pairs]:
@@ -153,6 +160,7 @@ def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, Mesh
     common: dict[str, Any] = {"seed": cfg.seed}
     if run.writes:
         tell(stores, cfg.eval_pairs)
+        tell_left_out(entries, train, test)
     train_pairs = MeshPairs(stores[0], length=cfg.pairs, resample=cfg.resample, ground_truth=cfg.ground_truth, **common)
     return train_pairs, MeshPairs(stores[1], length=cfg.eval_pairs, ground_truth=known(stores[1]), **common)
 
@@ -169,6 +177,30 @@ def tell(stores: list[MeshStore], eval_pairs: int) -> None:
             f"{eval_pairs} pairs repeat them",
             file=sys.stderr,
         )
+
+
+def tell_left_out(entries: list[MeshEntry], train: list[MeshEntry], test: list[MeshEntry]) -> None:
+    """Say which meshes are on neither side of the split, and why."""
+    (people, poses), (unseen_people, unseen_poses) = (
+        ({e.identity for e in side}, {e.pose for e in side}) for side in (train, test)
+    )
+    groups: dict[str, list[str]] = {}
+    for e in entries:
+        if e in train or e in test:
+            continue
+        if e.identity in unseen_people and e.pose in poses:
+            why = "an identity to test on in a pose to train on"
+        elif e.identity in people and e.pose in unseen_poses:
+            why = "an identity to train on in a pose to test on"
+        else:
+            why = "an identity or a pose of neither side"
+        groups.setdefault(why, []).append(e.path.name)
+    if groups:
+        count = sum(map(len, groups.values()))
+        print(f"{count} of {len(entries)} meshes are on neither side: what is tested on must be new", flush=True)
+    for why, names in groups.items():
+        shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+        print(f"  {len(names)} of {why}: {shown}", flush=True)
 
 
 def known(store: MeshStore) -> bool:

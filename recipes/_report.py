@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from _data import Pairs, inputs, told
+from _data import Pairs, inputs, told, unit_of
 from _run import Run
 from torch import Tensor, nn
 
@@ -17,8 +17,8 @@ from meshkit.viz import contact_sheet, error_colors, plot_curves, render
 
 
 @torch.no_grad()
-def evaluate(generator: nn.Module, pairs: Pairs, device: torch.device, count: int) -> dict[str, float]:
-    """Means over ``count`` unseen pairs, of the output and of two baselines; PMD and Chamfer in 1e-3 square metres.
+def evaluate(generator: nn.Module, pairs: Pairs, device: torch.device, count: int, unit: str) -> dict[str, float]:
+    """Means over ``count`` unseen pairs, of the output and of two baselines; PMD and Chamfer times 1000.
 
     Empty where neither ground truth nor correspondence is known.
     """
@@ -37,7 +37,7 @@ def evaluate(generator: nn.Module, pairs: Pairs, device: torch.device, count: in
             columns.setdefault(f"chamfer{name}", []).append(1e3 * chamfer_distance(center(verts), batch.ground_truth))
         if result.plan is not None and bool((batch.correspondence >= 0).all()):
             matched = correspondence_error(result.plan.argmax(), batch.pose, batch.correspondence)
-            columns.setdefault("correspondence_m", []).append(matched)
+            columns.setdefault(f"correspondence_{unit}", []).append(matched)
     generator.train(training)
     return {name: round(float(torch.cat(values).mean()), 4) for name, values in columns.items()}
 
@@ -50,31 +50,36 @@ def generate(generator: nn.Module, batch: PairBatch, place: int) -> Any:
     return generator(batch.identity, batch.pose, **told(generator, known))
 
 
-def report(run: Run, generator: nn.Module, pairs: Pairs, device: torch.device, facts: dict[str, Any]) -> None:
-    """Evaluate on unseen pairs; write summary.json, curves.png, sheet.png and meshes/."""
-    figures = evaluate(generator, pairs, device, len(pairs))
+def report(
+    run: Run, generator: nn.Module, pairs: Pairs, device: torch.device, facts: dict[str, Any], *, kind: str
+) -> None:
+    """Evaluate on unseen pairs of ``kind`` of data; write summary.json, curves.png, pmd.png, sheet.png and meshes/."""
+    unit = unit_of(kind)
+    figures = evaluate(generator, pairs, device, len(pairs), unit)
     summary = {
         "test": figures,
         "test_pairs": len(pairs),
-        "units": "PMD and Chamfer (squared, both directions summed) in 1e-3 m^2, correspondence in m",
+        "units": f"PMD and Chamfer (squared, both directions summed) in 1e-3 {unit}^2, correspondence in {unit}",
         **facts,
         "parameters": sum(p.numel() for p in generator.parameters()),
         "machine": run.load_json("machine.json"),
         "threads": torch.get_num_threads(),
     }
     run.save_json("summary.json", summary)
-    draw_curves(run)
-    draw_sheet(run, generator, pairs, device)
+    draw_curves(run, unit)
+    draw_sheet(run, generator, pairs, device, unit)
     print(f"\n{len(pairs)} unseen pairs        PMD e-3   Chamfer e-3" if "pmd" in figures else "")
     for title, key in (("copy the identity", "_copy_identity"), ("copy the warped", "_copy_warped"), ("output", "")):
         if f"pmd{key}" in figures:
             print(f"  {title:<20} {figures[f'pmd{key}']:8.2f}   {figures[f'chamfer{key}']:8.2f}")
-    if "correspondence_m" in figures:
-        print(f"matched vertices are {100 * figures['correspondence_m']:.1f} cm from the true ones on average")
+    off = figures.get(f"correspondence_{unit}")
+    if off is not None:
+        length = f"{100 * off:.1f} cm" if unit == "m" else f"{off:.3f} {unit}"
+        print(f"matched vertices are {length} from the true ones on average")
     print(f"pictures, meshes and figures: {run.folder}")
 
 
-def draw_curves(run: Run) -> None:
+def draw_curves(run: Run, unit: str) -> None:
     records = run.read_log()
     if not records:
         return
@@ -93,13 +98,13 @@ def draw_curves(run: Run) -> None:
             run.path("pmd.png"),
             {"unseen pairs": ([t for t, _ in points], [value for _, value in points])},
             xlabel="training time (minutes)",
-            ylabel="PMD (1e-3 m²)",
+            ylabel=f"PMD (1e-3 {unit}²)",
             logy=False,
         )
 
 
 @torch.no_grad()
-def draw_sheet(run: Run, generator: nn.Module, pairs: Pairs, device: torch.device, rows: int = 6) -> None:
+def draw_sheet(run: Run, generator: nn.Module, pairs: Pairs, device: torch.device, unit: str, *, rows: int = 6) -> None:
     """Rows of pictures, and the meshes as files; ground truth and error where they are known."""
     generator.eval()
     worst, sheet, captions, titles = 0.15, [], [], [""]
@@ -127,5 +132,6 @@ def draw_sheet(run: Run, generator: nn.Module, pairs: Pairs, device: torch.devic
         for name in ("identity", "pose", "output", "ground truth"):
             if name in views:
                 save_mesh(run.path("meshes") / f"pair{b}_{name.replace(' ', '_')}.obj", *views[name][:2])
-    colorbar = (0.0, 100 * worst, "distance to ground truth (cm)") if "error" in titles else None
+    bar = (100 * worst, "cm") if unit == "m" else (worst, unit)
+    colorbar = (0.0, bar[0], f"distance to ground truth ({bar[1]})") if "error" in titles else None
     contact_sheet(sheet, column_titles=titles, captions=captions, colorbar=colorbar).save(run.path("sheet.png"))

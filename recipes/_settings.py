@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 import tyro
+from _command_line import read
 
 from meshkit.models import GeneratorConfig
 
@@ -33,7 +32,7 @@ class Settings:
     """Folder that holds the runs."""
     resume: bool = False
     """Go on from the run's last checkpoint, if it has one, with the settings it was begun with: of the other flags only
-    --out, --name, --threads, --accelerator, --devices, --graph, --compile and --workers count then."""
+    --out, --name, --threads, --accelerator, --devices, --graph, --compile, --workers and --skip-bad count then."""
     apply: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="IDENTITY POSE")] = None
     """Do not train: give the first mesh file the pose of the second, with the weights of run --name."""
     result: Path = Path("posed.obj")
@@ -119,19 +118,4 @@ def parse(presets: dict[str, S], description: str | None) -> S:
         if flag == "--preset":
             chosen = own if joined else value
     default = presets.get(chosen, presets["tiny"])
-    kind: Any = type(default)
-    return tyro.cli(kind, default=default, description=description)  # type: ignore[no-any-return]
-
-
-def typed(kind: type, words: Sequence[str]) -> list[str]:
-    """The settings that a command line names, ``model.`` before those of the generator.
-
-    As tyro reads them: ``--lr=1``, ``--eval_pairs 1``, ``--no-arap``, ``--model.no-residual``.
-    """
-    known = {f.name for f in fields(kind)} | {f"model.{f.name}" for f in fields(GeneratorConfig)}
-    found = []
-    for word in words:
-        if word.startswith("--"):
-            name = word[2:].partition("=")[0].replace("-", "_")
-            found += [n for n in (name, re.sub(r"^(model\.)?no_", r"\1", name)) if n in known][:1]
-    return list(dict.fromkeys(found))
+    return read(type(default), description, default)

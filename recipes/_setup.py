@@ -8,9 +8,9 @@ from dataclasses import asdict, replace
 from operator import attrgetter
 from typing import Any
 
+from _command_line import typed
 from _machine import rank, world_size
 from _run import UserError
-from _settings import typed
 from torch import nn
 
 from meshkit.models import GeneratorConfig, load_generator, load_pretrained, pretrained_names
@@ -71,6 +71,8 @@ def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = Non
         values |= {"betas": tuple(values["betas"]), "out": cfg.out, "name": cfg.name, "resume": True, "apply": None}
         values |= {"result": cfg.result, "threads": cfg.threads, "accelerator": cfg.accelerator, "devices": cfg.devices}
         values |= {"graph": cfg.graph, "compile": cfg.compile, "workers": cfg.workers}
+        # A mesh file may have gone bad since; who asks to leave it out is heard.
+        values["skip_bad"] = values.get("skip_bad", False) or cfg.skip_bad
         begun = type(cfg)(**values, model=model)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"config.json of {cfg.out / cfg.name} is no run's ({error}): choose another --name") from None

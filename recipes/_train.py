@@ -15,7 +15,7 @@ from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
-from _data import data
+from _data import data, unit_of
 from _fabric import connect
 from _machine import keep_freed_memory
 from _report import evaluate, report
@@ -123,7 +123,7 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
         record: dict[str, Any] = {"step": s + 1, "seconds": round(seconds, 2), **losses}
         if (s + 1) % cfg.eval_every == 0 and s + 1 < steps and run.writes:
             few = min(24, len(test_pairs))
-            record["eval"] = evaluate(generator, test_pairs, fabric.device, few)
+            record["eval"] = evaluate(generator, test_pairs, fabric.device, few, unit_of(cfg.data))
             if "pmd" in record["eval"]:
                 bar.write(f"step {s + 1}: PMD {record['eval']['pmd']:.2f}e-3 on {few} unseen pairs")
         run.log(record)
@@ -146,4 +146,4 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
             "train_minutes": round(seconds / 60, 2),
             "share_of_time_waiting_for_data": round(waiting / max(seconds, 1e-9), 4),
         }
-        report(run, generator, test_pairs, fabric.device, facts)
+        report(run, generator, test_pairs, fabric.device, facts, kind=cfg.data)

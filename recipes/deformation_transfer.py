@@ -19,7 +19,7 @@ from types import SimpleNamespace
 from typing import Literal, cast
 
 import torch
-import tyro
+from _command_line import read
 from _data import data
 from _report import report
 from _run import Run, UserError, guard
@@ -82,7 +82,7 @@ class DeformationTransfer(nn.Module):
 
 def main() -> None:
     """Transfer all test pairs, and report."""
-    cfg = tyro.cli(Config, description=__doc__)
+    cfg = read(Config, __doc__)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
     if not 1 <= cfg.eval_pairs <= 400:
@@ -103,7 +103,7 @@ def main() -> None:
     _, pairs = data(settings, run, workers=1)
     assert isinstance(pairs, PosePairs)
     generator = DeformationTransfer(pairs, cfg.source)
-    report(run, generator, pairs, torch.device("cpu"), {"source": cfg.source})
+    report(run, generator, pairs, torch.device("cpu"), {"source": cfg.source}, kind=cfg.data)
     print(f"{sum(generator.times) / len(generator.times):.3f} s for each transfer")
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import tyro
+from _command_line import read
 from _run import UserError, guard
 from _tables_measure import (
     METRICS,
@@ -183,7 +183,7 @@ def check(cfg: Config) -> None:
 
 def main() -> None:
     """Train, measure, write."""
-    cfg = tyro.cli(Config, description=__doc__)
+    cfg = read(Config, __doc__)
     check(cfg)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)

@@ -226,11 +226,14 @@ def test_autocast(variant, dtype, walk):
 @pytest.mark.parametrize(
     ("x", "cond", "message"),
     [
-        ((5, C), (1, 5, D), r"must agree in B and N, got \(5, 6\)"),
+        ((5, C), (1, 5, D), r"x must have shape \(B, N, C\), got \(5, 6\); add the batch dimension with x\[None\]"),
+        ((1, 5, C), (5, D), r"cond must have shape \(B, N, D\), got \(5, 4\); add .* with cond\[None\]"),
+        ((1, C, 5), (1, 5, D), r"expected x with 6 channels \(B, N, 6\), got \(1, 6, 5\); .* transpose it with x.mT"),
+        ((1, 5, C), (1, D, 5), r"expected cond with 4 channels .* transpose it with cond.mT"),
         ((1, 5, C), (1, 4, D), "must agree in B and N"),
         ((2, 5, C), (1, 5, D), "must agree in B and N"),
-        ((1, 5, C + 1), (1, 5, D), "expected x with 6 and cond with 4 channels, got 7 and 4"),
-        ((1, 5, C), (1, 5, D + 1), "got 6 and 5"),
+        ((1, 5, C + 1), (1, 5, D), r"expected x with 6 channels \(B, N, 6\), got \(1, 5, 7\)$"),
+        ((1, 5, C), (1, 5, D + 1), r"expected cond with 4 channels \(B, N, 4\), got \(1, 5, 5\)"),
     ],
 )
 def test_elain_shape_errors(x, cond, message):
@@ -484,18 +487,94 @@ def test_state_dict_names(kind):
         (lambda: SoftAdaIN(3, 3, gate="tanh"), "gate must be \"sigmoid\" or None, got 'tanh'"),
         (lambda: elain(torch.ones(1, 2, 3), 0, 0, weight=0, variant="x"), 'must be "released" or "paper"'),
         (lambda: AdaIN(3, 2)(torch.ones(2, 4, 3), torch.ones(1, 4, 2)), r"\(B, M, D\) must agree in B, got"),
-        (lambda: AdaIN(3, 2)(torch.ones(1, 4, 3), torch.ones(1, 4, 3)), "expected x with 3 and cond with 2"),
+        (lambda: AdaIN(3, 2)(torch.ones(1, 4, 3), torch.ones(1, 4, 3)), "expected cond with 2 channels"),
         (
             lambda: AdaIN(3, 2)(torch.ones(1, 4, 3), torch.ones(1, 5, 2), cond_mask=torch.ones(1, 4) > 0),
             r"cond_mask must have shape \(1, 5\)",
         ),
         (lambda: adain(torch.ones(1, 4, 3), torch.ones(1, 4, 2)), "must agree in B and C"),
-        (lambda: soft_adain(torch.ones(4, 3), torch.ones(1, 4, 3), weight=torch.ones(1)), "must agree in B and C"),
+        (lambda: soft_adain(torch.ones(4, 3), torch.ones(1, 4, 3), weight=torch.ones(1)), r"x\[None\]"),
+        (lambda: adain(torch.ones(1, 4, 3), torch.ones(4, 3)), r"style must have shape \(B, M, C\), got \(4, 3\)"),
+        (lambda: modulate(torch.ones(4, 3), Modulation(*torch.ones(3, 1, 1, 3))), r"x must have shape .* x\[None\]"),
     ],
 )
 def test_norm_errors(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+X, COND = torch.ones(1, 5, C), torch.ones(1, 5, D)
+
+
+@pytest.mark.parametrize("kind", [ElaIN, SPAdaIN, AdaIN, SoftAdaIN, SPADE])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((X, None), r"cond must be a tensor \(B, [NM], D\), got None"),
+        ((X.numpy(), COND), r"x must be a tensor \(B, N, C\), got ndarray; convert it with torch.from_numpy"),
+        ((X, COND.tolist()), r"cond must be a tensor .* got list"),
+        (
+            (X.double(), COND),
+            r"x is torch.float64, but the parameters of \w+ are torch.float32: .* x.to\(torch.f",
+        ),
+        ((X.half(), COND.half()), r"x is torch.float16, but the parameters of"),
+        ((X.long(), COND), r"x is torch.int64, but"),
+    ],
+)
+@pytest.mark.parametrize("block", [False, True])
+def test_what_is_no_features_is_named(kind, arguments, message, block):
+    module = ConditionalResBlock(C, D, norm=kind) if block else kind(C, D)
+    with pytest.raises(TypeError, match=message):
+        module(*arguments)
+
+
+def test_a_mask_that_is_no_tensor_is_named():
+    with pytest.raises(TypeError, match=r"mask must be a bool tensor \(1, 5\) or None, got ndarray"):
+        ElaIN(C, D)(X, COND, mask=torch.ones(1, 5).bool().numpy())
+
+
+def test_one_dtype_is_not_asked_for_under_autocast():
+    norm = SPAdaIN(C, D)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert norm(X.bfloat16(), COND).shape == X.shape
+
+
+@pytest.mark.parametrize("with_module", [False, True])
+def test_a_norm_without_the_constructor_of_its_base_says_so(with_module):
+    class Own(ConditionalNorm):
+        def __init__(self, num_features, cond_features):
+            self.width = num_features
+            if with_module:
+                self.map = torch.nn.Linear(cond_features, num_features)
+
+        def modulation(self, cond, mean, std, *, cond_mask=None):
+            raise AssertionError
+
+    with pytest.raises(TypeError, match=r"Own.__init__ must begin with super\(\).__init__\(num_f"):
+        Own(C, D)
+
+
+def test_other_errors_of_a_constructor_stay_as_they_are():
+    class Own(ConditionalNorm):
+        def __init__(self, num_features, cond_features):
+            super().__init__(num_features, cond_features)
+            self.missing  # noqa: B018
+
+    with pytest.raises(AttributeError, match="missing"):
+        Own(C, D)
+
+
+def test_a_norm_whose_modulation_takes_no_cond_mask_says_so():
+    with pytest.raises(TypeError, match=r"Own.modulation must take cond_mask: modulation\(self, cond, mean, std, \*, "):
+
+        class Own(ConditionalNorm):
+            def modulation(self, cond, mean, std):
+                raise AssertionError
+
+
+def test_a_part_of_a_modulation_that_is_no_tensor_is_named():
+    with pytest.raises(TypeError, match="shift_bias of the modulation must be a tensor, got float"):
+        modulate(X, Modulation(torch.zeros(1, 1, C), torch.zeros(1, 1, C), 1.0))
 
 
 def test_a_norm_without_modulation_says_so():
@@ -736,7 +815,7 @@ def test_statistics_gradcheck():
 @pytest.mark.parametrize(
     ("shape", "mask", "message"),
     [
-        ((4, 3), None, r"x must have shape \(B, N, C\) .* got \(4, 3\)"),
+        ((4, 3), None, r"x must have shape \(B, N, C\), got \(4, 3\); add the batch"),
         ((1, 0, 3), None, "at least one vertex"),
         ((1, 4, 3), (1, 3), r"mask must have shape \(1, 4\) .* got \(1, 3\)"),
     ],

@@ -58,7 +58,7 @@ def draw_weights() -> None:
             )
             captions.append([name, "", "", score(meshes[3], meshes[4]), "", ""])
     titles = ["identity", "pose", "warped", "output", "ground truth", "error"]
-    bar = (0.0, 100 * WORST, "distance to ground truth (cm)")
+    bar = (0.0, 100 * WORST, "distance to ground truth (cm; animals: 0.01 units)")
     sheet = contact_sheet(pictures, column_titles=titles, captions=captions, colorbar=bar)
     sheet.quantize(128).save(IMAGES / "shipped_weights.png", optimize=True)
 

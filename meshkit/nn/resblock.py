@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -42,6 +43,7 @@ class ConditionalResBlock(nn.Module):
 
     Raises:
         ValueError: a negative slope, or shapes that do not fit.
+        TypeError: a norm of another signature; no tensors, or ``x`` and the parameters in two dtypes.
 
     Reference:
         X-DualNet, "Pose transfer module"; LeakyReLU slope 0.2 and spectral norm from the released code.
@@ -72,6 +74,7 @@ class ConditionalResBlock(nn.Module):
         self.slope = slope
         wrap: Callable[[nn.Module], Any] = spectral_norm if spectral else lambda layer: layer
         self.norm_0, self.norm_1, self.norm_s = (norm(num_features, cond_features) for _ in range(3))
+        _check_norm(self.norm_0)
         self.conv_0 = wrap(nn.Linear(num_features, num_features))
         self.conv_1 = wrap(nn.Linear(num_features, num_features))
         self.conv_s = wrap(nn.Linear(num_features, num_features, bias=False))
@@ -137,3 +140,19 @@ class ConditionalResBlock(nn.Module):
         mean, std = norm.statistics(x, mask=mask) if statistics is None else statistics
         modulation = norm.modulation(cond, mean, std, cond_mask=cond_mask)
         return modulate(x, modulation, slope=self.slope, weight=weight, bias=bias)
+
+
+def _check_norm(norm: object) -> None:
+    """Name a norm that could not be called, here and not in the first forward pass."""
+    if not isinstance(norm, nn.Module):
+        raise TypeError(f"norm(num_features, cond_features) must give a torch.nn.Module, got {type(norm).__name__}")
+    if isinstance(norm, ConditionalNorm):
+        return
+    signature = inspect.signature(norm.forward)
+    try:
+        signature.bind("x", "cond", mask=None, cond_mask=None)
+    except TypeError as error:
+        raise TypeError(
+            f"a norm is called as norm(x, cond, mask=mask, cond_mask=cond_mask), but {type(norm).__name__} has "
+            f"forward{signature}: {error}"
+        ) from None

@@ -9,7 +9,9 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
+from meshkit._checks import check_channels, check_dtype, check_features
 from meshkit._repr import settings
+from meshkit.batching import check_mask
 from meshkit.neighbors import gather_vertices, knn
 from meshkit.nn._edge_mlp import EPS, edge_mlp
 from meshkit.scatter import segment_sum
@@ -43,7 +45,8 @@ class SetConv(nn.Module):
         ``x (B, N, C)``, ``positions (B, N, 3)``, ``neighbors (B, N, k)`` int64; the result is ``(B, N, out_features)``.
 
     Raises:
-        ValueError: negative slope.
+        ValueError: negative slope, or shapes that do not fit.
+        TypeError: no tensors, ``neighbors`` that are not int64, or ``x`` and the parameters in two dtypes.
 
     Reference:
         X-DualNet, "Network architecture" (pointnet++-like conv). Layer sizes as in the released code, which takes the
@@ -73,7 +76,14 @@ class SetConv(nn.Module):
         self, x: Tensor, positions: Tensor, neighbors: Tensor | Neighborhoods, *, mask: Tensor | None = None
     ) -> Tensor:
         """Convolve ``x`` at ``positions`` over ``neighbors``; ``mask`` is ``(B, N)``, True = real vertex."""
-        graph = neighbors if isinstance(neighbors, Neighborhoods) else neighborhoods(positions, neighbors, mask)
+        check_features(x)
+        check_channels(x, self.in_features)
+        check_dtype(x, self)
+        if isinstance(neighbors, Neighborhoods):
+            graph = neighbors
+        else:
+            _check_graph(x, positions, neighbors, mask)
+            graph = neighborhoods(positions, neighbors, mask)
         kind = x.device.type
         products = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else x.dtype
         with torch.autocast(kind, enabled=False):
@@ -108,6 +118,23 @@ class SetConv(nn.Module):
         shift = self.shifts[0] - graph.mean @ to_position
         u = torch.baddbmm(shift, torch.cat([x, graph.positions], 2), folded)
         return u, graph.positions @ to_position
+
+
+def _check_graph(x: Tensor, positions: Tensor, neighbors: Tensor, mask: Tensor | None) -> None:
+    """Name what does not fit ``x (B, N, C)``; indices out of range are left to the lookup."""
+    check_features(positions, name="positions", layout="(B, N, 3)")
+    check_channels(positions, 3, name="positions")
+    check_features(neighbors, name="neighbors", layout="(B, N, k)")
+    if neighbors.dtype != torch.int64:
+        raise TypeError(
+            f"neighbors must be int64 indices, as meshkit.neighbors.knn returns them, got {neighbors.dtype}"
+        )
+    if not x.shape[:2] == positions.shape[:2] == neighbors.shape[:2]:
+        raise ValueError(
+            f"x, positions and neighbors must agree in B and N, got {tuple(x.shape)}, {tuple(positions.shape)} and "
+            f"{tuple(neighbors.shape)}"
+        )
+    check_mask(mask, *x.shape[:2])
 
 
 class Neighborhoods(NamedTuple):
@@ -166,6 +193,7 @@ class SetConvExtractor(nn.Module):
 
     Raises:
         ValueError: descriptors missing, unexpected or of the wrong shape; fewer than ``k`` vertices.
+        TypeError: no tensors, or ``positions`` and the parameters in two dtypes.
 
     Example:
         >>> SetConvExtractor((8, 16), k=4)(torch.randn(1, 30, 3)).shape
@@ -186,10 +214,20 @@ class SetConvExtractor(nn.Module):
 
     def forward(self, positions: Tensor, *, descriptors: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Features of each vertex."""
-        if positions.dim() != 3 or positions.shape[2] != 3:
+        check_features(positions, name="positions", layout="(B, N, 3)")
+        if positions.shape[2] != 3:
             raise ValueError(
                 f"positions must have shape (B, N, 3), got {tuple(positions.shape)}; further channels go to descriptors"
             )
+        check_dtype(positions, self, name="positions")
+        check_mask(mask, *positions.shape[:2])
+        if descriptors is not None:
+            check_features(descriptors, name="descriptors", layout="(B, N, D)")
+            if descriptors.shape[:2] != positions.shape[:2]:
+                raise ValueError(
+                    f"descriptors (B, N, D) and positions (B, N, 3) must agree in B and N, got "
+                    f"{tuple(descriptors.shape)} and {tuple(positions.shape)}"
+                )
         given = 0 if descriptors is None else descriptors.shape[-1]
         if given != self.descriptors:
             raise ValueError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from meshkit._checks import check_features
 from meshkit._repr import settings
 from meshkit.batching import masked_mean
 from meshkit.norm.base import ConditionalNorm, check_gate
@@ -87,7 +88,9 @@ def soft_adain(
         >>> soft_adain(x, style, weight=torch.tensor(0.5), eps=0.0).flatten().tolist()
         [2.5, 6.5]
     """
-    if x.dim() != 3 or style.dim() != 3 or x.shape[::2] != style.shape[::2]:
+    check_features(x)
+    check_features(style, name="style", layout="(B, M, C)")
+    if x.shape[::2] != style.shape[::2]:
         raise ValueError(
             f"x (B, N, C) and style (B, M, C) must agree in B and C, got {tuple(x.shape)}, {tuple(style.shape)}"
         )

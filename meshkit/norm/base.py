@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
+from functools import wraps
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
+from meshkit._checks import check_channels, check_dtype, check_features
 from meshkit._repr import settings
 from meshkit.batching import check_mask
 from meshkit.norm.modulation import Modulation, modulate
@@ -29,6 +34,8 @@ class ConditionalNorm(nn.Module):
 
     Raises:
         ValueError: shapes that do not fit.
+        TypeError: no tensors, or ``x`` and the parameters in two dtypes outside autocast; ``cond`` may have any. A
+            subclass whose ``modulation`` takes no ``cond_mask``, or whose constructor leaves out this one's.
 
     Example:
         A norm of one's own, which runs fused in a :class:`~meshkit.nn.ConditionalResBlock` like the package's:
@@ -45,6 +52,17 @@ class ConditionalNorm(nn.Module):
 
     per_vertex = True
     unbiased = False
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Name the usual slips of a subclass where they are made, not in the first forward pass."""
+        super().__init_subclass__(**options)
+        taken = inspect.signature(cls.modulation).parameters.values()
+        if not any(p.name == "cond_mask" or p.kind is p.VAR_KEYWORD for p in taken):
+            raise TypeError(
+                f"{cls.__name__}.modulation must take cond_mask: modulation(self, cond, mean, std, *, cond_mask=None)"
+            )
+        if "__init__" in cls.__dict__:
+            cls.__init__ = _calling_super(cls.__init__)  # type: ignore[method-assign]
 
     def __init__(self, num_features: int, cond_features: int, *, eps: float = 1e-5) -> None:
         super().__init__()
@@ -65,17 +83,17 @@ class ConditionalNorm(nn.Module):
         self, x: Tensor, cond: Tensor, mask: Tensor | None, cond_mask: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Check the arguments of :meth:`forward`; returns ``x``, ``cond`` with padding zeroed, and ``cond_mask``."""
-        rows = "B and N" if self.per_vertex else "B"
-        if x.dim() != 3 or cond.dim() != 3 or x.shape[: 1 + self.per_vertex] != cond.shape[: 1 + self.per_vertex]:
+        layout = f"(B, {'N' if self.per_vertex else 'M'}, D)"
+        check_features(x)
+        check_features(cond, name="cond", layout=layout)
+        check_channels(x, self.num_features)
+        check_channels(cond, self.cond_features, name="cond")
+        if x.shape[: 1 + self.per_vertex] != cond.shape[: 1 + self.per_vertex]:
+            rows = "B and N" if self.per_vertex else "B"
             raise ValueError(
-                f"x (B, N, C) and cond (B, {'N' if self.per_vertex else 'M'}, D) must agree in {rows}, "
-                f"got {tuple(x.shape)}, {tuple(cond.shape)}"
+                f"x (B, N, C) and cond {layout} must agree in {rows}, got {tuple(x.shape)}, {tuple(cond.shape)}"
             )
-        if x.shape[2] != self.num_features or cond.shape[2] != self.cond_features:
-            raise ValueError(
-                f"expected x with {self.num_features} and cond with {self.cond_features} channels, "
-                f"got {x.shape[2]} and {cond.shape[2]}"
-            )
+        check_dtype(x, self)
         if cond_mask is None and cond.shape[1] == x.shape[1]:
             cond_mask = mask
         check_mask(mask, *x.shape[:2])
@@ -100,6 +118,27 @@ class ConditionalNorm(nn.Module):
     def modulation(self, cond: Tensor, mean: Tensor, std: Tensor, *, cond_mask: Tensor | None = None) -> Modulation:
         """Scale and shift for a condition whose padded rows are zero, given the statistics of ``x``."""
         raise NotImplementedError(f"{type(self).__name__} must define modulation(cond, mean, std, *, cond_mask=None)")
+
+
+def _calling_super(init: Any) -> Any:
+    """A constructor that says when it left out that of :class:`ConditionalNorm`."""
+
+    @wraps(init)
+    def checked(self: ConditionalNorm, *arguments: Any, **options: Any) -> None:
+        try:
+            init(self, *arguments, **options)
+        except AttributeError as error:
+            if "_modules" in self.__dict__:
+                raise
+            raise _left_out(self) from error
+        if "num_features" not in self.__dict__:
+            raise _left_out(self)
+
+    return checked
+
+
+def _left_out(norm: ConditionalNorm) -> TypeError:
+    return TypeError(f"{type(norm).__name__}.__init__ must begin with super().__init__(num_features, cond_features)")
 
 
 def check_gate(gate: str | None) -> None:

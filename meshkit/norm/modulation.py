@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, linear
 
+from meshkit._checks import check_features
 from meshkit.norm._tiles import fill, tile_buffer, tiles, traced
 
 __all__ = ["Modulation", "modulate"]
@@ -64,7 +65,9 @@ def modulate(
         of a linear map then has; otherwise the result has the dtype of ``x``.
 
     Raises:
-        ValueError: a bias without a weight, a negative slope, or a modulation that does not fit ``x``.
+        ValueError: a bias without a weight, a negative slope, ``x`` of another shape, or a modulation that does not
+            fit ``x``.
+        TypeError: ``x`` or a part of the modulation is no tensor.
 
     Example:
         >>> x = torch.tensor([[[1.0], [3.0]]])
@@ -77,6 +80,7 @@ def modulate(
         raise ValueError("bias needs a weight: fold it into the shift instead")
     if slope is not None and slope < 0:
         raise ValueError(f"slope must not be negative, got {slope}")
+    check_features(x)
     check_modulation(x, modulation)
     device = x.device.type
     autocast = torch.is_autocast_enabled(device)
@@ -96,7 +100,10 @@ def check_modulation(x: Tensor, modulation: Modulation) -> None:
         raise ValueError(f"a norm's modulation must return a Modulation, got {type(modulation).__name__}")
     batch, rows, channels = x.shape
     for name in ("mean", "scale_bias", "shift_bias"):
-        shape = getattr(modulation, name).shape
+        value = getattr(modulation, name)
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{name} of the modulation must be a tensor, got {type(value).__name__}")
+        shape = value.shape
         wanted = (batch, 1, channels)
         if shape == wanted:  # nearly always, and every norm of every step comes by here
             continue

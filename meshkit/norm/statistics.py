@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from meshkit._checks import check_features
 from meshkit.batching import check_mask, masked_mean
 from meshkit.norm._tiles import fill, tile_buffer, tiles, traced
 
@@ -45,7 +46,8 @@ def instance_statistics(
         >>> mean.item(), std.item()
         (2.0, 1.0)
     """
-    if x.dim() != 3 or x.shape[1] == 0:
+    check_features(x)
+    if x.shape[1] == 0:
         raise ValueError(f"x must have shape (B, N, C) with at least one vertex, got {tuple(x.shape)}")
     check_mask(mask, x.shape[0], x.shape[1])
     x = x.to(torch.promote_types(x.dtype, torch.float32))

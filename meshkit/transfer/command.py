@@ -25,14 +25,14 @@ _ROWS = 6  # of the picture of a sequence
 
 
 class _Parser(argparse.ArgumentParser):
-    """Names the option that was probably meant."""
+    """Tells a mistake in one line, and names the option that was probably meant."""
 
     def error(self, message: str) -> NoReturn:
         known = [option for action in self._actions for option in action.option_strings if option.startswith("--")]
         for word in re.findall(r"--[\w-]+", message) if "unrecognized" in message else ():
             near = difflib.get_close_matches(word, known, n=1)
             message += f"; did you mean {near[0]}?" if near else ""
-        super().error(message)
+        self.exit(2, f"error: {message}; --help lists the options\n")
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
         """Takes ``--pose-facing -y`` as well as ``--pose-facing=-y``: an axis is no option."""

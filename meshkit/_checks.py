@@ -1,0 +1,41 @@
+"""What the layers ask of the features they are given; the messages say what came and what to do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+def check_features(x: Any, *, name: str = "x", layout: str = "(B, N, C)") -> None:
+    """Check that ``x`` is a batch of vertex features.
+
+    Raises:
+        TypeError: no tensor.
+        ValueError: not three dimensions.
+    """
+    if not isinstance(x, Tensor):
+        hint = "; convert it with torch.from_numpy" if type(x).__module__ == "numpy" else ""
+        raise TypeError(f"{name} must be a tensor {layout}, got {'None' if x is None else type(x).__name__}{hint}")
+    if x.dim() != 3:
+        hint = f"; add the batch dimension with {name}[None]" if x.dim() == 2 else ""
+        raise ValueError(f"{name} must have shape {layout}, got {tuple(x.shape)}{hint}")
+
+
+def check_channels(x: Tensor, channels: int, *, name: str = "x") -> None:
+    """Check the last dimension of features ``(B, N, C)``."""
+    if x.shape[2] != channels:
+        first = x.shape[1] == channels
+        hint = f"; the channels come last here: transpose it with {name}.mT" if first else ""
+        raise ValueError(f"expected {name} with {channels} channels (B, N, {channels}), got {tuple(x.shape)}{hint}")
+
+
+def check_dtype(x: Tensor, module: nn.Module, *, name: str = "x") -> None:
+    """Check that features and parameters have one dtype; autocast converts them itself."""
+    own = next(module.parameters(), None)
+    if own is not None and own.dtype != x.dtype and not torch.is_autocast_enabled(x.device.type):
+        raise TypeError(
+            f"{name} is {x.dtype}, but the parameters of {type(module).__name__} are {own.dtype}: convert one of them, "
+            f"as with {name}.to({own.dtype})"
+        )
