@@ -186,7 +186,7 @@ torch.testing.assert_close(batch, alone)
 
 preds[~pred_mask] = float("nan")
 preds.requires_grad_()
-loss = chamfer_loss(preds, targets, mask=pred_mask, target_mask=target_mask)
+loss = chamfer_loss(preds, targets, pred_mask=pred_mask, target_mask=target_mask)
 loss.backward()
 expect("chamfer_loss of the batch", loss.detach(), float(alone.mean()))
 assert (preds.grad[~pred_mask] == 0).all() and preds.grad[pred_mask].isfinite().all()

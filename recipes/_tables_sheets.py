@@ -21,6 +21,9 @@ NOISE_PAIRS, TOPOLOGY_PAIRS = 40, 20  # the first test pairs, that noise and tri
 NOISE = (0.0, 5.0, 10.0, 20.0)  # millimetres
 SIZES = (1000, 2000, 3445)
 WEIGHTS = ("corenet3d-humans", "xdualnet-humans")
+TOPOLOGY_WEIGHTS = NOISE_WEIGHTS = WEIGHTS[0]  # of the sheets
+MATCHING_WEIGHTS = WEIGHTS[1]
+COARSE = 700  # vertices of the sheet's coarsest mesh, which the table of triangulations leaves out
 PICTURE = (220, 220)
 ABLATED = ("corenet3d_spadain", "corenet3d", "xdualnet_no_arap", "xdualnet_no_corr", "xdualnet")
 
@@ -106,7 +109,7 @@ def topology_errors(count: int = TOPOLOGY_PAIRS) -> dict[str, Any]:
 def topology_sheet(path: Path) -> None:
     """One pose on bodies of different triangulations, and on a coarse one of none of the shipped topologies."""
     _, split = shipped("humans", 1000)
-    net, grid = pretrained(WEIGHTS[0]), []
+    net, grid, captions = pretrained(TOPOLOGY_WEIGHTS), [], []
     for a, p, b, q in split.test_pairs[2:5, :, None]:
         two = shipped("humans", 3445)[0]
         pose = (two(b, q)[0], two.faces)
@@ -117,12 +120,13 @@ def topology_sheet(path: Path) -> None:
             shown += [(identity, one.faces)]
             shown += [(net(identity, pose[0], identity_faces=one.faces, pose_faces=two.faces), one.faces)]
         fine = shipped("humans", 6890)[0]
-        coarse = simplify(fine(a, p)[0], fine.faces, 700)
+        coarse = simplify(fine(a, p)[0], fine.faces, COARSE)
         shown += [(coarse.verts, coarse.faces)]
         output = net(coarse.verts, pose[0], identity_faces=coarse.faces, pose_faces=two.faces)
         grid.append(pictures([*shown, (output, coarse.faces)]))
-    titles = ["pose, 3445", "identity, 1000", "output", "identity, 2000", "output", "identity, 700", "output"]
-    save(contact_sheet(grid, column_titles=titles), path)
+        captions.append(["", *("", TOPOLOGY_WEIGHTS) * 3])
+    titles = ["pose, 3445", "identity, 1000", "output", "identity, 2000", "output", f"identity, {COARSE}", "output"]
+    save(contact_sheet(grid, column_titles=titles, captions=captions), path)
 
 
 @torch.no_grad()
@@ -130,7 +134,7 @@ def correspondence_sheet(path: Path, cfg: Any) -> None:
     """Matches of the shipped weights between two bodies; lines of those more than 10 cm off are red."""
     row = min(5, cfg.eval_pairs - 1)
     batch = test_pairs("humans", None, cfg.eval_pairs, cfg.out)[[(0, row)]]
-    result = generate(generator_of(WEIGHTS[1], cfg.out).eval(), batch, row)
+    result = generate(generator_of(MATCHING_WEIGHTS, cfg.out).eval(), batch, row)
     matches = result.plan.argmax()[0]
     off = (batch.pose[0, matches] - batch.pose[0, batch.correspondence[0]]).norm(dim=1)
     figure = correspondence_figure(
@@ -138,7 +142,7 @@ def correspondence_sheet(path: Path, cfg: Any) -> None:
         (batch.pose[0], batch.pose_faces[0]),
         matches,
         correct=off < 0.1,
-        titles=["identity", "pose"],
+        titles=[f"identity, matched by {MATCHING_WEIGHTS}", "pose"],
     )
     save(figure, path)
 
@@ -147,12 +151,12 @@ def correspondence_sheet(path: Path, cfg: Any) -> None:
 def noise_sheet(path: Path) -> None:
     """A pose mesh with more and more noise, and what becomes of the result."""
     body, split = shipped("humans", 1000)
-    net, grid, captions = pretrained(WEIGHTS[0]), [], []
+    net, grid, captions = pretrained(NOISE_WEIGHTS), [], []
     for i in (1, 4):
         found = [noisy(net, body, split.test_pairs[i], sigma) for sigma in NOISE]
         meshes = [(found[0][0], body.faces)] + [(m, body.faces) for f in found for m in (f[1], f[2])]
         grid.append(pictures(meshes))
-        captions.append(["", *(text for f in found for text in ("", f"PMD {f[3]:.1f}e-3"))])
+        captions.append([NOISE_WEIGHTS, *(text for f in found for text in ("", f"PMD {f[3]:.1f}e-3"))])
     titles = ["identity", *(text for sigma in NOISE for text in (f"pose, {sigma:g} mm", "output"))]
     save(contact_sheet(grid, column_titles=titles, captions=captions), path)
 
@@ -182,7 +186,7 @@ def draw_sheets(
         if (kind, "xdualnet") in there:
             job = there[kind, "xdualnet"]
             worst = torch.tensor(errors(job)).topk(min(4, cfg.eval_pairs)).indices.tolist()
-            columns = {"X-DualNet": job.name, "shipped weights": f"xdualnet-{kind}"}
+            columns = {"X-DualNet": job.name, f"xdualnet-{kind}, shipped": f"xdualnet-{kind}"}
             sheet(f"failures-{kind}", transfer_sheet, kind, columns, worst, cfg)
     if "humans" in cfg.data:
         sheet("topologies", topology_sheet)

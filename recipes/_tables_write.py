@@ -11,7 +11,15 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
-from _tables_sheets import NOISE_PAIRS, TOPOLOGY_PAIRS
+from _tables_sheets import (
+    COARSE,
+    MATCHING_WEIGHTS,
+    NOISE_PAIRS,
+    NOISE_WEIGHTS,
+    TOPOLOGY_PAIRS,
+    TOPOLOGY_WEIGHTS,
+    WEIGHTS,
+)
 from _tables_train import Job, command, jobs
 
 from meshkit.io import atomic_write
@@ -33,12 +41,14 @@ SHEETS = {
     "comparison-humans": "Comparison, humans, first seed",
     "comparison-animals": "Comparison, animals, first seed",
     "ablation": "Ablations, first seed",
-    "topologies": "Other triangulations, shipped weights",
-    "correspondence": "Correspondence, shipped weights: lines of matches more than 10 cm off are red",
-    "noise": "Noise on the pose mesh, shipped weights",
-    "noise_curve": f"PMD against noise, shipped weights, first {NOISE_PAIRS} test pairs",
-    "failures-humans": "The worst test pairs, humans",
-    "failures-animals": "The worst test pairs, animals",
+    "topologies": f"Other triangulations, shipped weights {TOPOLOGY_WEIGHTS}; the mesh of {COARSE} vertices is "
+    "simplified from the one of 6890, and not in the table of triangulations",
+    "correspondence": f"Correspondence, shipped weights {MATCHING_WEIGHTS}: lines of matches more than 10 cm off are "
+    "red",
+    "noise": f"Noise on the pose mesh, shipped weights {NOISE_WEIGHTS}",
+    "noise_curve": f"PMD against noise, shipped weights {' and '.join(WEIGHTS)}, first {NOISE_PAIRS} test pairs",
+    "failures-humans": "The worst test pairs of X-DualNet, humans, beside shipped weights xdualnet-humans",
+    "failures-animals": "The worst test pairs of X-DualNet, animals, beside shipped weights xdualnet-animals",
 }
 
 

@@ -132,7 +132,7 @@ def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float
             result.plan,
             result.target_b,
             normalization=cfg.corr_normalization,
-            mask=result.mask_b,
+            pose_mask=result.mask_b,
             identity_mask=batch.identity_mask,
         )
         losses["corr"] = cfg.lambda_corr * back

@@ -94,7 +94,7 @@ def with_plan(inputs: Inputs) -> Inputs:
         inputs.pop("pose_features"),
         eps=0.3,
         mask_x=inputs.get("identity_mask"),
-        mask_y=inputs.get("mask"),
+        mask_y=inputs.get("pose_mask"),
     )
     return {**inputs, "plan": plan.dense()}
 
@@ -246,7 +246,7 @@ ENTRIES |= {
     "BackwardCorrespondenceLoss": Entry(
         BackwardCorrespondenceLoss,
         {"identity_features": ("a", 4), "pose_features": ("b", 4), "pose_verts": ("b", 3)},
-        {"a": ["identity_mask"], "b": ["mask"]},
+        {"a": ["identity_mask"], "b": ["pose_mask"]},
         prepare=with_plan,
         out=None,
     ),
@@ -254,7 +254,7 @@ ENTRIES |= {
 SURFACE = {"masks": {"a": ["mask"]}, "index": {"faces": ("a", strip)}, "out": None, "compile": "breaks"}
 POINTS = {
     "rows": {"pred": ("a", 3), "target": ("b", 3)},
-    "masks": {"a": ["mask"], "b": ["target_mask"]},
+    "masks": {"a": ["pred_mask"], "b": ["target_mask"]},
     "out": None,
 }
 ENTRIES |= {

@@ -337,14 +337,14 @@ def test_backward_equals_loops(matching, form, normalization, reduction):
         [backward_literally(t, v, form, normalization) for t, v in zip(plans, poses, strict=True)], reduction
     )
     options = {"form": form, "normalization": normalization, "reduction": reduction}
-    assert_close(backward_correspondence_loss(plan, pose, mask=mask, **options), expected)
+    assert_close(backward_correspondence_loss(plan, pose, pose_mask=mask, **options), expected)
     for garbage in GARBAGE:
         real = identity_mask[:, :, None] & mask[:, None, :]
         poisoned = torch.where(real, plan, garbage), torch.where(mask[..., None], pose, garbage)
-        value = backward_correspondence_loss(*poisoned, mask=mask, identity_mask=identity_mask, **options)
+        value = backward_correspondence_loss(*poisoned, pose_mask=mask, identity_mask=identity_mask, **options)
         assert_close(value, expected)
     value = backward_correspondence_loss(
-        Factored(torch.ones(2, 6).double(), plan, mask.double()), pose, mask=mask, **options
+        Factored(torch.ones(2, 6).double(), plan, mask.double()), pose, pose_mask=mask, **options
     )
     assert_close(value, expected)
 
@@ -357,7 +357,7 @@ def test_backward_gradient_ignores_padding(matching, form, normalization):
     plan = torch.where(real, plan, float("nan")).requires_grad_()
     pose = torch.where(mask[..., None], pose, float("nan")).requires_grad_()
     value = backward_correspondence_loss(
-        plan, pose, mask=mask, identity_mask=identity_mask, form=form, normalization=normalization
+        plan, pose, pose_mask=mask, identity_mask=identity_mask, form=form, normalization=normalization
     )
     leaves = [plan, pose] if form == "coordinates" else [plan]
     for grad, valid in zip(torch.autograd.grad(value, leaves), (real, mask), strict=False):
@@ -378,7 +378,7 @@ def test_backward_takes_a_known_warp(matching, normalization):
     plan, pose, mask, identity_mask, _, _ = matching
     scale = plan.sum(2, keepdim=True).where(plan.sum(2, keepdim=True) > 0, 1) if normalization == "rows" else 1
     factored = Factored(torch.ones(2, 6).double(), plan, mask.double())
-    options = {"mask": mask, "identity_mask": identity_mask, "normalization": normalization}
+    options = {"pose_mask": mask, "identity_mask": identity_mask, "normalization": normalization}
     expected = backward_correspondence_loss(plan, pose, **options)
     warped = torch.where(identity_mask[..., None], plan @ pose / scale, float("nan"))
     torch.testing.assert_close(backward_correspondence_loss(factored, pose, warped=warped, **options), expected)
@@ -391,8 +391,8 @@ def test_backward_known_warp_of_a_row_without_mass_is_ignored(matching):
     plan, pose, mask, _, _, _ = matching
     warped = plan @ pose / plan.sum(2, keepdim=True)  # 0 / 0 in the rows without mass
     assert warped.isnan().any()
-    value = backward_correspondence_loss(plan, pose, mask=mask, warped=warped)
-    torch.testing.assert_close(value, backward_correspondence_loss(plan, pose, mask=mask))
+    value = backward_correspondence_loss(plan, pose, pose_mask=mask, warped=warped)
+    torch.testing.assert_close(value, backward_correspondence_loss(plan, pose, pose_mask=mask))
 
 
 @forms
@@ -452,7 +452,7 @@ def test_matrix_form_in_blocks_equals_the_whole_gram_matrix(shape, normalization
     (gradient,) = torch.autograd.grad(expected[reduction].sum(), dense)
     pose = torch.zeros(2, columns, 3, dtype=torch.float64)
     options = {"form": "matrix", "normalization": normalization, "reduction": reduction}
-    options |= {"mask": mask, "identity_mask": identity_mask}
+    options |= {"pose_mask": mask, "identity_mask": identity_mask}
     real = identity_mask[:, :, None] & mask[:, None]
     for block in (3, 512):
         monkeypatch.setattr("meshkit.losses.backward_correspondence._BLOCK", block)
@@ -506,7 +506,7 @@ def test_modules_equal_functions():
         EdgeRatioLoss(min_length=1.5, reduction="none")(verts, reference, STRIP, mask=mask),
         edge_ratio_loss(verts, reference, STRIP, mask=mask, min_length=1.5, reduction="none"),
     )
-    keywords = {"mask": mask, "identity_mask": torch.ones(2, 4, dtype=torch.bool), "warped": rand(2, 4, 3)}
+    keywords = {"pose_mask": mask, "identity_mask": torch.ones(2, 4, dtype=torch.bool), "warped": rand(2, 4, 3)}
     assert torch.equal(
         BackwardCorrespondenceLoss(normalization="none", reduction="sum")(plan, verts, **keywords),
         backward_correspondence_loss(plan, verts, normalization="none", reduction="sum", **keywords),
@@ -552,7 +552,10 @@ V, P = torch.zeros(2, 5, 3), torch.ones(2, 4, 5)
         (lambda: backward_correspondence_loss(P.mT, V), r"= \(2, N, 5\) to match pose_verts, got \(2, 5, 4\)"),
         (lambda: backward_correspondence_loss(P[0], V), "plan must have shape"),
         (lambda: backward_correspondence_loss(P[:, :0], V), "plan must have shape"),
-        (lambda: backward_correspondence_loss(P, V, mask=torch.ones(2, 4, dtype=torch.bool)), r"mask must have .*5\)"),
+        (
+            lambda: backward_correspondence_loss(P, V, pose_mask=torch.ones(2, 4, dtype=torch.bool)),
+            r"pose_mask must have .*5\)",
+        ),
         (lambda: backward_correspondence_loss(P, V, identity_mask=torch.ones(2, 5).bool()), "identity_mask must"),
         (lambda: backward_correspondence_loss(P, V, warped=V), r"warped must have shape \(2, 4, 3\)"),
         (lambda: BackwardCorrespondenceLoss(form="dense"), "form must"),

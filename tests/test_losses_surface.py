@@ -1,6 +1,7 @@
 """Losses on surfaces and point sets against literal loops, closed forms and SciPy; and what is kept of the faces."""
 
 import gc
+import inspect
 import math
 import re
 from pathlib import Path
@@ -12,6 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+from meshkit import losses, metrics
 from meshkit.batching import pad, pad_faces
 from meshkit.deform import arap_energy as arap_energy_of_deform
 from meshkit.losses import (
@@ -231,7 +233,7 @@ def test_chamfer_equals_trees(reduction, direction, squared, garbage):
             expected = expected + reduced([(d.sum(), len(d)) for d in near], reduction)
     (pred, mask), (target, target_mask) = pad(preds), pad(targets)
     leaves = [torch.where(m[..., None], x, garbage).requires_grad_() for x, m in ((pred, mask), (target, target_mask))]
-    options = {"mask": mask, "target_mask": target_mask, "squared": squared, "direction": direction}
+    options = {"pred_mask": mask, "target_mask": target_mask, "squared": squared, "direction": direction}
     value = chamfer_loss(*leaves, **options, reduction=reduction)
     assert_near(value, expected, 1e-12)
     for gradient, m in zip(torch.autograd.grad(value.sum(), leaves), (mask, target_mask), strict=True):
@@ -265,7 +267,9 @@ def test_measures_of_other_components_are_the_same_objects():
     options = {"eps": 0.5, "n_iters": 7, "tol": None, "anneal": None, "debias": False}
     values = sinkhorn_divergence(verts, rest, mask_x=mask, **options)
     for reduction, expected in (("none", values), ("mean", values.mean())):
-        assert torch.equal(SinkhornDivergenceLoss(**options, reduction=reduction)(verts, rest, mask=mask), expected)
+        assert torch.equal(
+            SinkhornDivergenceLoss(**options, reduction=reduction)(verts, rest, pred_mask=mask), expected
+        )
 
 
 def test_sinkhorn_divergence_of_a_translation_is_its_squared_length():
@@ -293,8 +297,8 @@ def test_modules_equal_functions():
     )
     options = {"squared": False, "direction": "forward", "reduction": "sum"}
     assert torch.equal(
-        ChamferLoss(**options)(verts, rest, mask=mask, target_mask=mask.flip(0)),
-        chamfer_loss(verts, rest, mask=mask, target_mask=mask.flip(0), **options),
+        ChamferLoss(**options)(verts, rest, pred_mask=mask, target_mask=mask.flip(0)),
+        chamfer_loss(verts, rest, pred_mask=mask, target_mask=mask.flip(0), **options),
     )
 
 
@@ -381,7 +385,7 @@ NONE = torch.zeros(2, 5, dtype=torch.bool)
         (lambda: chamfer_loss(V[0], V), "pred must"),
         (lambda: chamfer_loss(V, V[0]), "target must"),
         (lambda: chamfer_loss(V, V[:1]), "one batch size"),
-        (lambda: chamfer_loss(V, V, mask=NONE), r"mask marks no real vertex in samples \[0, 1\]"),
+        (lambda: chamfer_loss(V, V, pred_mask=NONE), r"pred_mask marks no real vertex in samples \[0, 1\]"),
         (lambda: chamfer_loss(V, V, target_mask=NONE), "target_mask marks no real vertex"),
         (lambda: ChamferLoss(direction="there"), "direction"),
         (lambda: ChamferLoss(reduction="avg"), "reduction"),
@@ -392,3 +396,14 @@ NONE = torch.zeros(2, 5, dtype=torch.bool)
 def test_errors(call, match):
     with pytest.raises(ValueError, match=match):
         call()
+
+
+@pytest.mark.parametrize("module", [losses, metrics])
+def test_meshes_that_need_not_correspond_have_masks_named_after_them(module):
+    """One convention: a lone mask is ``mask``; of two masks each says whose it is."""
+    for name in module.__all__:
+        call = getattr(getattr(module, name), "forward", getattr(module, name))
+        if not callable(call) or name[0] == "_":
+            continue
+        named = [key for key in inspect.signature(call).parameters if key == "mask" or key.endswith("_mask")]
+        assert "mask" not in named or named == ["mask"], (name, named)

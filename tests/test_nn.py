@@ -323,3 +323,35 @@ def test_moments_of_the_graph_stay_in_float32_under_autocast():
     with torch.autocast("cpu", torch.float16):
         value = conv(positions, positions, neighbors)
     assert_near(value.float(), conv(positions, positions, neighbors), 2e-2)
+
+
+POINTS = torch.linspace(-1, 1, 2 * 12 * 3).view(2, 12, 3)
+NEAR = knn(POINTS, 4)
+
+
+@pytest.mark.parametrize(
+    ("call", "kind", "message"),
+    [
+        (lambda e, c: e(POINTS.numpy()), TypeError, r"positions must be a tensor \(B, N, 3\), got ndarray; convert it"),
+        (lambda e, c: e(POINTS[0]), ValueError, r"got \(12, 3\); add the batch dimension with positions\[None\]"),
+        (lambda e, c: e(POINTS.mT), ValueError, r"got \(2, 3, 12\); transpose them with positions.mT"),
+        (
+            lambda e, c: e(POINTS.double()),
+            TypeError,
+            r"positions is torch.float64, but the parameters",
+        ),
+        (lambda e, c: e(POINTS, mask=torch.ones(2, 11).bool()), ValueError, r"mask must have shape \(2, 12\)"),
+        (lambda e, c: e(POINTS, descriptors=torch.ones(2, 11, 2)), ValueError, "must agree in B and N"),
+        (lambda e, c: c(None, POINTS, NEAR), TypeError, r"x must be a tensor \(B, N, C\), got None"),
+        (lambda e, c: c(POINTS.half(), POINTS, NEAR), TypeError, "x is torch.float16, but"),
+        (lambda e, c: c(POINTS[..., :2], POINTS, NEAR), ValueError, "expected x with 3 channels"),
+        (lambda e, c: c(POINTS, POINTS, NEAR.int()), TypeError, "neighbors must be int64 indices, .* got torch.int32"),
+        (lambda e, c: c(POINTS, POINTS, NEAR[0]), ValueError, r"neighbors must have shape \(B, N, k\), got \(12, 4\)"),
+        (lambda e, c: c(POINTS, POINTS[:1], NEAR), ValueError, "x, positions and neighbors must agree in B and N"),
+        (lambda e, c: SetConvExtractor(()), ValueError, r"widths must be at least one positive .*got \(\)"),
+        (lambda e, c: SetConv(0, 3), ValueError, "in_features and out_features must be positive, got 0, 3"),
+    ],
+)
+def test_set_convolutions_name_what_does_not_fit(call, kind, message):
+    with pytest.raises(kind, match=message):
+        call(SetConvExtractor((4,), k=4), SetConv(3, 4))

@@ -285,3 +285,36 @@ def test_bad_counts_are_named(tables: Callable[..., Path]) -> None:
         tables("--large-pairs", -1)
     with pytest.raises(recipe_module("_run").UserError, match="twice: humans humans"):
         tables("--data", "humans", "humans")
+
+
+def test_sheets_name_the_shipped_weights_they_are_made_with(
+    config: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    sheets, write, said = recipe_module("_tables_sheets"), recipe_module("_tables_write"), {}
+
+    def contact_sheet(grid: Any, *, column_titles: list[str], captions: list[list[str]]) -> Any:
+        assert all(len(row) == len(column_titles) for row in captions)
+        return [*column_titles, *captions[0]]
+
+    def transfer_sheet(path: Path, kind: str, columns: dict[str, str], *rest: Any) -> None:
+        said[path.stem] = list(columns)
+
+    monkeypatch.setattr(sheets, "contact_sheet", contact_sheet)
+    monkeypatch.setattr(sheets, "correspondence_figure", lambda *meshes, titles, **options: titles)
+    monkeypatch.setattr(sheets, "pictures", lambda meshes: [None] * len(meshes))
+    monkeypatch.setattr(sheets, "save", lambda sheet, path: said.update({path.stem: sheet}))
+    monkeypatch.setattr(sheets, "NOISE", (0.0,))
+    monkeypatch.setattr(sheets, "transfer_sheet", transfer_sheet)
+    monkeypatch.setattr(sheets, "plot_curves", lambda *arguments, **options: None)
+    job = recipe_module("_tables_train").Job("humans", "xdualnet", 0)
+    noise = {"sigma_mm": [0.0], **{name: [1.0] for name in sheets.WEIGHTS}}
+    sheets.draw_sheets(tmp_path, [job], noise, lambda job: [1.0, 2.0, 3.0], config)
+    for name, weights in (
+        ("topologies", "corenet3d-humans"),
+        ("correspondence", "xdualnet-humans"),
+        ("noise", "corenet3d-humans"),
+        ("failures-humans", "xdualnet-humans"),
+    ):
+        assert any(weights in text for text in said[name]), name
+        assert weights in write.SHEETS[name], name
+    assert "identity, 700" in said["topologies"] and "700 vertices" in write.SHEETS["topologies"]

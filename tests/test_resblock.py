@@ -292,3 +292,29 @@ def test_two_forwards_under_distributed_data_parallel(tmp_path):
 def test_norm_must_be_a_factory(norm):
     with pytest.raises(ValueError, match=r"called as norm\(num_features, cond_features\)"):
         ConditionalResBlock(C, D, norm=norm)
+
+
+class WithoutCondMask(torch.nn.Module):
+    def forward(self, x, cond, *, mask=None):
+        return x
+
+
+@pytest.mark.parametrize(
+    ("norm", "message"),
+    [
+        (
+            lambda c, d: WithoutCondMask(),
+            r"called as norm\(x, cond, mask=mask, .*, but WithoutCondMask",
+        ),
+        (lambda c, d: torch.nn.LayerNorm(c), r"LayerNorm has forward\(input"),
+        (lambda c, d: c, r"must give a torch.nn.Module, got int"),
+    ],
+)
+def test_a_norm_of_another_signature_is_named_at_construction(norm, message):
+    with pytest.raises(TypeError, match=message):
+        ConditionalResBlock(3, 4, norm=norm)
+
+
+def test_a_linear_map_that_does_not_fit_is_named():
+    with pytest.raises(ValueError, match="then must take the 3 channels of the block, it takes 5"):
+        ConditionalResBlock(3, 4)(torch.ones(1, 5, 3), torch.ones(1, 5, 4), then=torch.nn.Linear(5, 2))

@@ -48,7 +48,7 @@ def backward_correspondence_loss(
     *,
     form: Form = "coordinates",
     normalization: Normalization = "rows",
-    mask: Tensor | None = None,
+    pose_mask: Tensor | None = None,
     identity_mask: Tensor | None = None,
     warped: Tensor | None = None,
     reduction: Reduction = "mean",
@@ -84,7 +84,7 @@ def backward_correspondence_loss(
             stores T, ``(B, N, M)``, if T is a tensor or passes a gradient; else it reads blocks of T and stores no
             matrix.
         normalization: ``"rows"``, ``"both"`` or ``"none"``, see above.
-        mask: ``(B, M)`` bool, True = real pose vertex; None if all are real.
+        pose_mask: ``(B, M)`` bool, True = real pose vertex; None if all are real.
         identity_mask: ``(B, N)`` bool, True = real identity vertex. Only for plans that have mass in padded rows.
         warped: T V ``(B, N, 3)`` under the same normalization, if known already; saves one product. Coordinates only.
         reduction: ``"sum"`` for the squared norms above, averaged over samples; ``"mean"`` for the mean over each
@@ -117,7 +117,7 @@ def backward_correspondence_loss(
         raise ValueError('warped is of no use with form="matrix"; leave it out, or take form="coordinates"')
     check_verts(pose_verts, name="pose_verts")
     batch, num = pose_verts.shape[:2]
-    check_mask(mask, batch, num)
+    check_mask(pose_mask, batch, num, name="pose_mask")
     if len(plan.shape) != 3 or (plan.shape[0], plan.shape[2]) != (batch, num) or plan.shape[1] == 0:
         raise ValueError(
             f"plan must have shape (B, N, M) = ({batch}, N, {num}) to match pose_verts, got {tuple(plan.shape)}"
@@ -130,11 +130,11 @@ def backward_correspondence_loss(
     # Bfloat16 products would drown the difference of nearly equal terms.
     with torch.autocast(pose_verts.device.type, enabled=False):
         verts = at_least_float32(pose_verts)
-        real = verts.new_ones(batch, num, dtype=torch.bool) if mask is None else mask
+        real = verts.new_ones(batch, num, dtype=torch.bool) if pose_mask is None else pose_mask
         if form == "matrix":
-            return _matrix_form(plan, real, mask, identity_mask, normalization, reduction)
+            return _matrix_form(plan, real, pose_mask, identity_mask, normalization, reduction)
         if isinstance(plan, Tensor):
-            block = _real_block(plan, mask, identity_mask)
+            block = _real_block(plan, pose_mask, identity_mask)
             dtype = torch.promote_types(block.dtype, verts.dtype)
             plan, verts = _DensePlan(block.to(dtype)), verts.to(dtype)
         verts = torch.where(real[..., None], verts, 0)
@@ -328,7 +328,7 @@ class BackwardCorrespondenceLoss(nn.Module):
         plan: Tensor | PlanLike,
         pose_verts: Tensor,
         *,
-        mask: Tensor | None = None,
+        pose_mask: Tensor | None = None,
         identity_mask: Tensor | None = None,
         warped: Tensor | None = None,
     ) -> Tensor:
@@ -338,7 +338,7 @@ class BackwardCorrespondenceLoss(nn.Module):
             pose_verts,
             form=self.form,
             normalization=self.normalization,
-            mask=mask,
+            pose_mask=pose_mask,
             identity_mask=identity_mask,
             warped=warped,
             reduction=self.reduction,

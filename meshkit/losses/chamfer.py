@@ -20,7 +20,7 @@ def chamfer_loss(
     pred: Tensor,
     target: Tensor,
     *,
-    mask: Tensor | None = None,
+    pred_mask: Tensor | None = None,
     target_mask: Tensor | None = None,
     squared: bool = True,
     direction: Direction = "both",
@@ -41,7 +41,7 @@ def chamfer_loss(
     Args:
         pred: P, ``(B, N, 3)``.
         target: Q, ``(B, M, 3)``; M need not be N.
-        mask: ``(B, N)`` bool, True = real vertex; None if all are real.
+        pred_mask: ``(B, N)`` bool, True = real vertex; None if all are real.
         target_mask: ``(B, M)`` bool.
         squared: squared distances; else distances, which pass the subgradient 0 where points coincide.
         direction: ``"both"``, or one sum alone: ``"forward"`` from each predicted point to the target, ``"backward"``
@@ -72,15 +72,15 @@ def chamfer_loss(
     check_verts(target, name="target")
     if len(pred) != len(target):
         raise ValueError(f"pred and target must have one batch size, got {tuple(pred.shape)} and {tuple(target.shape)}")
-    check_mask(mask, *pred.shape[:2], nonempty=True)
+    check_mask(pred_mask, *pred.shape[:2], name="pred_mask", nonempty=True)
     check_mask(target_mask, *target.shape[:2], name="target_mask", nonempty=True)
     dtype = torch.promote_types(at_least_float32(pred).dtype, target.dtype)
     pred, target = pred.to(dtype), target.to(dtype)
     values = []
     if direction != "backward":
-        values.append(_one_way(pred, mask, target, target_mask, squared, reduction))
+        values.append(_one_way(pred, pred_mask, target, target_mask, squared, reduction))
     if direction != "forward":
-        values.append(_one_way(target, target_mask, pred, mask, squared, reduction))
+        values.append(_one_way(target, target_mask, pred, pred_mask, squared, reduction))
     return torch.stack(values).sum(0)
 
 
@@ -132,13 +132,13 @@ class ChamferLoss(nn.Module):
         return settings(self, "squared", "direction", "reduction")
 
     def forward(
-        self, pred: Tensor, target: Tensor, *, mask: Tensor | None = None, target_mask: Tensor | None = None
+        self, pred: Tensor, target: Tensor, *, pred_mask: Tensor | None = None, target_mask: Tensor | None = None
     ) -> Tensor:
         """Return the loss, see :func:`chamfer_loss`."""
         return chamfer_loss(
             pred,
             target,
-            mask=mask,
+            pred_mask=pred_mask,
             target_mask=target_mask,
             squared=self.squared,
             direction=self.direction,

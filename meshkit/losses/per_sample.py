@@ -65,7 +65,7 @@ class SinkhornDivergenceLoss(nn.Module):
         return settings(self, "eps", "n_iters", "tol", "anneal", "debias", "reduction")
 
     def forward(
-        self, pred: Tensor, target: Tensor, *, mask: Tensor | None = None, target_mask: Tensor | None = None
+        self, pred: Tensor, target: Tensor, *, pred_mask: Tensor | None = None, target_mask: Tensor | None = None
     ) -> Tensor:
         """Return the divergence of ``pred (B, N, 3)`` and ``target (B, M, 3)``, a scalar or ``(B,)``."""
         values = sinkhorn_divergence(
@@ -76,7 +76,7 @@ class SinkhornDivergenceLoss(nn.Module):
             tol=self.tol,
             anneal=self.anneal,
             debias=self.debias,
-            mask_x=mask,
+            mask_x=pred_mask,
             mask_y=target_mask,
         )
         return values.mean() if self.reduction == "mean" else values

@@ -116,6 +116,10 @@ class ConditionalResBlock(nn.Module):
         masks: dict[str, Any] = {"mask": mask, "cond_mask": cond_mask}
         weight_1, bias, weight_s = self.conv_1.weight, self.conv_1.bias, self.conv_s.weight
         if then is not None:
+            if then.in_features != weight_1.shape[0]:
+                raise ValueError(
+                    f"then must take the {weight_1.shape[0]} channels of the block, it takes {then.in_features}"
+                )
             weight_1, bias, weight_s = then.weight @ weight_1, then(bias), then.weight @ weight_s
         h = self._branch(norm_0, x, cond, self.conv_0.weight, self.conv_0.bias, statistics=shared, **masks)
         y = self._branch(norm_1, h, cond, weight_1, bias, **masks)

@@ -45,7 +45,7 @@ class SetConv(nn.Module):
         ``x (B, N, C)``, ``positions (B, N, 3)``, ``neighbors (B, N, k)`` int64; the result is ``(B, N, out_features)``.
 
     Raises:
-        ValueError: negative slope, or shapes that do not fit.
+        ValueError: negative slope, no channels, or shapes that do not fit.
         TypeError: no tensors, ``neighbors`` that are not int64, or ``x`` and the parameters in two dtypes.
 
     Reference:
@@ -62,6 +62,8 @@ class SetConv(nn.Module):
         super().__init__()
         if not slope >= 0:
             raise ValueError(f"slope must not be negative (the maximum is taken before the activation), got {slope}")
+        if in_features < 1 or out_features < 1:
+            raise ValueError(f"in_features and out_features must be positive, got {in_features}, {out_features}")
         self.slope, self.in_features, self.out_features, self.recompute = slope, in_features, out_features, recompute
         widths = [in_features + 3, out_features, out_features, out_features]
         self.linears = nn.ModuleList(nn.Linear(i, o, bias=False) for i, o in pairwise(widths))
@@ -126,9 +128,7 @@ def _check_graph(x: Tensor, positions: Tensor, neighbors: Tensor, mask: Tensor |
     check_channels(positions, 3, name="positions")
     check_features(neighbors, name="neighbors", layout="(B, N, k)")
     if neighbors.dtype != torch.int64:
-        raise TypeError(
-            f"neighbors must be int64 indices, as meshkit.neighbors.knn returns them, got {neighbors.dtype}"
-        )
+        raise TypeError(f"neighbors must be int64 indices, as meshkit.neighbors.knn gives them, got {neighbors.dtype}")
     if not x.shape[:2] == positions.shape[:2] == neighbors.shape[:2]:
         raise ValueError(
             f"x, positions and neighbors must agree in B and N, got {tuple(x.shape)}, {tuple(positions.shape)} and "
@@ -204,6 +204,8 @@ class SetConvExtractor(nn.Module):
         self, widths: Sequence[int] = (32, 64, 128), *, k: int = 32, descriptors: int = 0, recompute: bool = False
     ) -> None:
         super().__init__()
+        if not widths or min(widths) < 1:
+            raise ValueError(f"widths must be at least one positive number of channels, got {tuple(widths)}")
         self.k, self.descriptors, self.out_features = k, descriptors, widths[-1]
         inputs = [3 + descriptors, *widths[:-1]]
         self.convs = nn.ModuleList(SetConv(i, o, recompute=recompute) for i, o in zip(inputs, widths, strict=True))
@@ -216,9 +218,10 @@ class SetConvExtractor(nn.Module):
         """Features of each vertex."""
         check_features(positions, name="positions", layout="(B, N, 3)")
         if positions.shape[2] != 3:
-            raise ValueError(
-                f"positions must have shape (B, N, 3), got {tuple(positions.shape)}; further channels go to descriptors"
+            hint = (
+                "transpose them with positions.mT" if positions.shape[1] == 3 else "further channels go to descriptors"
             )
+            raise ValueError(f"positions must have shape (B, N, 3), got {tuple(positions.shape)}; {hint}")
         check_dtype(positions, self, name="positions")
         check_mask(mask, *positions.shape[:2])
         if descriptors is not None:
