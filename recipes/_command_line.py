@@ -52,7 +52,11 @@ def accepted(kind: type, before: str = "") -> dict[str, Any]:
     hints, known = get_type_hints(kind, include_extras=True), dict[str, Any]()
     for field in fields(kind):  # type: ignore[arg-type]
         hint = hints[field.name]
-        known |= accepted(hint, f"{field.name}.") if is_dataclass(hint) else {before + field.name: hint}
+        known |= (
+            accepted(hint, f"{field.name}.")
+            if isinstance(hint, type) and is_dataclass(hint)
+            else {before + field.name: hint}
+        )
     return known
 
 

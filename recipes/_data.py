@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -151,7 +153,8 @@ def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, Mesh
         # Every process reads the cache; who comes first has made it.
         where = run.path(f"cache_{side}")
         try:
-            stores.append(MeshStore.build(chosen, where, skip_bad=cfg.skip_bad, progress=run.writes))
+            with plain_warnings():
+                stores.append(MeshStore.build(chosen, where, skip_bad=cfg.skip_bad, progress=run.writes))
         except MeshFileError as error:
             advice = "" if cfg.skip_bad else "; mend or remove the file, or leave out such files with --skip-bad"
             raise UserError(f"--data {cfg.data}: {error}{advice}") from None
@@ -163,6 +166,16 @@ def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, Mesh
         tell_left_out(entries, train, test)
     train_pairs = MeshPairs(stores[0], length=cfg.pairs, resample=cfg.resample, ground_truth=cfg.ground_truth, **common)
     return train_pairs, MeshPairs(stores[1], length=cfg.eval_pairs, ground_truth=known(stores[1]), **common)
+
+
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Warnings as lines of the error stream, without the place in the code that Python puts around them."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    for warning in caught:
+        print(f"warning: {warning.message}", file=sys.stderr)
 
 
 def tell(stores: list[MeshStore], eval_pairs: int) -> None:

@@ -1,6 +1,7 @@
 """What recipes say of a mistyped command line, of meshes that a split leaves out, and in which unit they report."""
 
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -78,6 +79,12 @@ def test_meshes_of_neither_side_of_a_split_are_named(tmp_path: Path, capsys: pyt
     assert "  1 of an identity or a pose of neither side: 9_9.ply" in capsys.readouterr().out
     tell([*train, *test], train, test)
     assert capsys.readouterr().out == ""
+
+
+def test_a_warning_shows_no_source_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with recipe_module("_data").plain_warnings():
+        warnings.warn("1 of 9 mesh files was left out", stacklevel=1)
+    assert capsys.readouterr().err == "warning: 1 of 9 mesh files was left out\n"
 
 
 def test_a_resumed_run_may_skip_files_that_went_bad(capsys: pytest.CaptureFixture[str]) -> None:
