@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -48,7 +49,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Path]:
 @pytest.fixture
 def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that look at training alone: figures and pictures take longer than a few small steps."""
-    monkeypatch.setattr(recipe_module("_train"), "report", lambda *_: None)
+    monkeypatch.setattr(recipe_module("_train"), "report", lambda *_, **options: None)
 
 
 @pytest.fixture(scope="module")
@@ -467,7 +468,7 @@ def test_flags_are_read_as_they_are_typed(monkeypatch: pytest.MonkeyPatch) -> No
         "eval_pairs",
         "lr",
     ]
-    assert settings.typed(recipe.Config, words) == expected
+    assert recipe_module("_command_line").typed(recipe.Config, words) == expected
     monkeypatch.setattr(sys, "argv", ["xdualnet.py", "--preset", "small", "--preset=tiny"])
     assert settings.parse(recipe.PRESETS, None) == recipe.PRESETS["tiny"], "of two presets the last counts, whole"
 
@@ -491,7 +492,7 @@ def test_a_generator_is_told_what_it_takes(batch: PairBatch) -> None:
 
 
 @pytest.mark.usefixtures("without_report")
-def test_damaged_files_are_named_or_left_out(run: Any, tmp_path: Path) -> None:
+def test_damaged_files_are_named_or_left_out(run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     place = body_files(tmp_path / "meshes", range(5), range(5))
     damaged = place / "1_1.ply"
     damaged.write_text("not a mesh")
