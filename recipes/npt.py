@@ -99,7 +99,9 @@ def main() -> None:
     if cfg.apply is not None:
         apply(cfg.out / cfg.name, cfg.apply, cfg.result)
     else:
-        train(replace(cfg, model=replace(cfg.model, architecture=f"npt_{cfg.variant}")), build, step)
+        variants: dict[str, Literal["npt_maxpool", "npt_original"]]
+        variants = {"maxpool": "npt_maxpool", "original": "npt_original"}
+        train(replace(cfg, model=replace(cfg.model, architecture=variants[cfg.variant])), build, step)
 
 
 if __name__ == "__main__":

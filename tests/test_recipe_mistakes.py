@@ -38,6 +38,8 @@ def told(monkeypatch: pytest.MonkeyPatch, recipe: str, line: str) -> str:
         ("xdualnet", "--model.k=a", "--model.k takes a whole number, got 'a'"),
         ("xdualnet", "--preset tinny", "--preset takes tiny, small or paper, got 'tinny'"),
         ("xdualnet", "--apply a.obj", "--apply takes 2 values, each a path, or None, got 'a.obj'"),
+        ("xdualnet", "--model.norm foo", "--model.norm takes elain or spadain, got 'foo'"),
+        ("xdualnet", "--model.descriptors hks", "--model.descriptors takes none or wks, got 'hks'"),
         ("corenet3d", "--betas 0", "--betas takes 2 values, each a number, got '0'"),
         ("npt", "--seed 1 2", "'2' belongs to no option"),
         ("paper_tables", "--data human", "--data takes one or more of humans or animals, got 'human'"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from meshkit.models.generator import PoseTransferGenerator
 from meshkit.models.npt import NPT
@@ -22,9 +22,9 @@ class GeneratorConfig:
     the encoder's channels.
     """
 
-    architecture: str = "matching"
+    architecture: Literal["matching", "npt_maxpool", "npt_original"] = "matching"
     """matching: X-DualNet and 3D-CoreNet; npt_maxpool, npt_original: NPT."""
-    extractor: str = "setconv"
+    extractor: Literal["setconv", "pointwise"] = "setconv"
     """setconv: X-DualNet; pointwise: 3D-CoreNet."""
     extractor_widths: tuple[int, ...] = (32, 64, 128)
     """Channels of the feature extractor. Paper: 32, 64, 128. 3D-CoreNet: 64, 128, 256. NPT: 64, 128, 1024."""
@@ -38,7 +38,7 @@ class GeneratorConfig:
     """Entropic regularisation of the matching. Paper: 0.03."""
     n_iters: int = 5
     """Sinkhorn iterations. Paper: 5."""
-    norm: str = "elain"
+    norm: Literal["elain", "spadain"] = "elain"
     """Conditional norm of the blocks: elain, or spadain, with which the paper compares it."""
     spectral: bool = True
     """Spectral normalisation in the blocks. Released code: yes."""
@@ -46,16 +46,16 @@ class GeneratorConfig:
     """The blocks displace the warped mesh instead of generating all of it. Paper: no."""
     normalize_plan: bool = True
     """Warp with the row-normalised plan. Released code: yes. Paper: no."""
-    condition: str = "auto"
+    condition: Literal["auto", "features", "descriptors"] = "auto"
     """What the blocks know of the identity: features, descriptors, or auto (descriptors where there are any). Paper:
     features."""
     rigid_radius: float | None = None
-    """Radius of the rigid moving least squares that the warped mesh passes through, in metres. Paper: none."""
+    """Radius of the rigid moving least squares that the warped mesh passes, in the meshes' unit. Paper: none."""
     match_size: bool = False
     """Scale the pose mesh to the identity's size before warping it, where there are descriptors. Paper: no."""
     symmetry: bool = False
     """In evaluation, resolve exchanged limbs with the identity's mirror image (needs faces). Paper: no."""
-    descriptors: str = "none"
+    descriptors: Literal["none", "wks"] = "none"
     """none: coordinates alone, the paper; wks: wave-kernel signatures and the size of the mesh besides."""
     num_signatures: int = 16
     """How many signatures, when there are any."""
