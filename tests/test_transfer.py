@@ -914,8 +914,39 @@ def test_strangers_are_reported(fine_transfer):
     for blob in (points, bumps):
         warnings = transfer((blob, torch.tensor(ball.faces)), **upright, pose_unit="m").report.warnings
         assert sum("99 of 100" in text for text in warnings) >= 3, warnings
-    # The matching stands the noise; the surface becomes so large that no body has it.
-    assert any("far from the size" in text for text in transfer((pose[0] + noise, pose[1]), **upright).report.warnings)
+    rough = transfer((pose[0] + noise, pose[1]), **upright).report.warnings
+    assert any("the pose mesh's surface is rough" in text for text in rough), rough
+
+
+@pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
+def test_wrong_axes_are_noticed_where_they_were_given(fine_transfer):
+    transfer, pose, _ = fine_transfer
+    assert not transfer(pose, pose_up="+z", pose_facing="-y").report.warnings
+    for up, facing in (("+y", "+z"), ("+z", "+x"), ("-z", "-y")):
+        (text, *_) = transfer(pose, pose_up=up, pose_facing=facing).report.warnings
+        assert text == f"pose: the axes given (up {up}, facing {facing}) seem wrong: leave them out to have them found"
+
+
+def test_the_rest_body_is_described_and_encoded_once(person, mover, monkeypatch):
+    config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16))
+    net = PretrainedTransfer(config.build(), config, card={"data": "humans", "vertices": 1000}).eval()
+    sizes = []
+    encode = net.generator.encode
+    monkeypatch.setattr(net.generator, "encode", lambda verts, **_: sizes.append(verts) or encode(verts, **_))
+    rest = _kinds.rest_body("humans")[0]
+    transfer = PoseTransfer(person, weights=net, refine=False, identity_up="+z")
+    for _ in range(2):
+        transfer(mover, pose_up="+z")
+    same = [verts for verts in sizes if verts.shape[1] == len(rest) and torch.allclose(verts[0], center(rest[None])[0])]
+    assert len(same) == 1 and len(sizes) > 12
+
+
+@pytest.mark.skipif("xdualnet-animals" not in pretrained_names(), reason="this checkout lacks the weights")
+def test_an_animal_in_meshkits_own_frame_is_not_in_doubt():
+    body = load_shipped("animals")[0]
+    verts = body(torch.tensor([0]), torch.tensor([0]))[0]
+    identity = PoseTransfer((verts, body.faces), weights="xdualnet-animals").identity
+    assert torch.equal(identity.rotation, torch.eye(3)) and identity.doubts == ()
 
 
 @pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")

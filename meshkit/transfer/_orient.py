@@ -15,7 +15,7 @@ from meshkit.transfer._frames import rotations
 from meshkit.transfer._kinds import rest_body
 from meshkit.transfer.confidence import row_entropies
 
-__all__ = ["RestBody", "agrees", "find_rotation"]
+__all__ = ["RestBody", "agreements", "agrees", "choose", "find_rotation"]
 
 DOUBT = 0.08
 """Lead in score below which an orientation that was found is in doubt."""
@@ -67,7 +67,6 @@ class RestBody:
         return generator
 
 
-@torch.no_grad()
 def find_rotation(
     rest: RestBody,
     verts: Tensor,
@@ -102,20 +101,21 @@ def find_rotation(
     Returns:
         The rotation (3, 3), and whether it is clear: its score leads that of the next best by more than 0.08.
     """
-    normals = vertex_normals(verts, faces)
-    scores = []
-    for rotation in candidates.to(verts):
-        of_normals, like = _agreement(rest, verts, normals, descriptors, rotation)
-        scores.append(of_normals + like / 8)
+    rows = agreements(rest, verts, faces, descriptors=descriptors, candidates=candidates)
     usual = torch.cat([rotations("+z", "-y"), rotations("+y", "+z")]) if usual is None else usual
     favoured = (candidates[:, None] == usual.to(candidates)).all(-1).all(-1).any(1)
-    score = torch.tensor(scores)
-    best = int((score + _CLEAR * favoured.cpu()).argmax())
+    best, clear = choose(rows, favoured.cpu())
+    return candidates[best], clear
+
+
+def choose(rows: Tensor, favoured: Tensor) -> tuple[int, bool]:
+    """Of :func:`agreements` (R, 2) the number of the best, and whether it is clear; ``favoured`` (R,) are the usual."""
+    score = rows[:, 0] + rows[:, 1] / 8
+    best = int((score + _CLEAR * favoured).argmax())
     others = score[torch.arange(len(score)) != best]
-    return candidates[best], bool(score[best] - others.max() > DOUBT)
+    return best, bool(score[best] - others.max() > DOUBT)
 
 
-@torch.no_grad()
 def agrees(rest: RestBody, verts: Tensor, faces: Tensor, *, descriptors: Tensor | None, rotation: Tensor) -> bool:
     """Whether an orientation that was given may be right: as :func:`find_rotation` sees it, the normals correlate.
 
@@ -123,19 +123,24 @@ def agrees(rest: RestBody, verts: Tensor, faces: Tensor, *, descriptors: Tensor 
     """
     if not isinstance(rest.net.generator, PoseTransferGenerator):
         return True
+    row = agreements(rest, verts, faces, descriptors=descriptors, candidates=rotation[None])
+    return float(row[0, 0]) >= AGREEMENT
+
+
+@torch.no_grad()
+def agreements(
+    rest: RestBody, verts: Tensor, faces: Tensor, *, descriptors: Tensor | None, candidates: Tensor
+) -> Tensor:
+    """(R, 2) for each candidate: correlation of normals with the matched ones; that of positions, less the entropy."""
     normals = vertex_normals(verts, faces)
-    return _agreement(rest, verts, normals, descriptors, rotation.to(verts))[0] >= AGREEMENT
-
-
-def _agreement(
-    rest: RestBody, verts: Tensor, normals: Tensor, descriptors: Tensor | None, rotation: Tensor
-) -> tuple[float, float]:
-    """Correlation of the normals of a turned mesh with the matched ones, and that of positions less the entropy."""
-    turned = center((verts @ rotation.T)[None])[0]
-    plan = rest.match(turned, descriptors)
-    there = plan.barycentric(rest.surface)[0]
-    like = _correlation(turned - turned.mean(0), there[:, :3] - there[:, :3].mean(0))
-    return _correlation(normals @ rotation.T, there[:, 3:]), like - _mean_row_entropy(plan)
+    rows = []
+    for rotation in candidates.to(verts):
+        turned = center((verts @ rotation.T)[None])[0]
+        plan = rest.match(turned, descriptors)
+        there = plan.barycentric(rest.surface)[0]
+        like = _correlation(turned - turned.mean(0), there[:, :3] - there[:, :3].mean(0))
+        rows.append((_correlation(normals @ rotation.T, there[:, 3:]), like - _mean_row_entropy(plan)))
+    return torch.tensor(rows)
 
 
 def _mean_row_entropy(plan: TransportPlan | DensePlan) -> float:
