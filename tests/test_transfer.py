@@ -40,7 +40,7 @@ from meshkit.transfer import (
 )
 from meshkit.transfer._frames import axis_name, axis_vector, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import Likeness, guess_kind
-from meshkit.transfer._prepare import named, open_mesh
+from meshkit.transfer._open import named, open_mesh
 from meshkit.transfer._units import find_scale, scale_to
 from meshkit.transfer.command import main, parser
 from meshkit.transfer.confidence import roughness, row_entropies
@@ -394,7 +394,7 @@ def test_the_kind_is_looked_at_once_and_where_it_counts(person, monkeypatch):
         looked.append(len(verts))
         return Likeness("humans", -1.0, 1.0)
 
-    monkeypatch.setattr("meshkit.transfer._prepare.guess_kind", look)
+    monkeypatch.setattr("meshkit.transfer._open.guess_kind", look)
     monkeypatch.setattr(choose, "pretrained_names", lambda: ["a"])
     monkeypatch.setattr(choose, "load_pretrained", lambda _: copier(name="a", data="humans", figures={"pmd": 1.0}))
     transfer_pose(person, person, **UPRIGHT)
@@ -596,7 +596,7 @@ def test_a_sequence_is_as_its_poses_one_by_one(person, moves):
 def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
     looked = []
     monkeypatch.setattr(
-        "meshkit.transfer._prepare.guess_kind",
+        "meshkit.transfer._open.guess_kind",
         lambda verts, _: looked.append(len(verts)) or Likeness("animals", 1.0, 1.0),
     )
     poses = [(v, moves[1]) for v in moves[0]]

@@ -19,7 +19,7 @@ from measure_usual import mesh_sources
 
 from meshkit.data import load_shipped
 from meshkit.transfer._kinds import guess_kind, shape_numbers
-from meshkit.transfer._prepare import open_mesh
+from meshkit.transfer._open import open_mesh
 
 SHRINKAGE = 1e-3  # variance added to every number; they vary by 0.01 to 0.1 within a kind
 POSES = {"humans": 1, "animals": 6}  # drawn for each body and resolution, to check

@@ -18,8 +18,9 @@ from measure_usual import Mesh, mesh_sources
 from meshkit.data import load_shipped
 from meshkit.models import load_pretrained, pretrained_names
 from meshkit.transfer._frames import rotations
+from meshkit.transfer._open import open_mesh
 from meshkit.transfer._orient import AGREEMENT, RestBody, agreements, choose
-from meshkit.transfer._prepare import open_mesh, prepare
+from meshkit.transfer._prepare import prepare
 
 PEOPLE = 40
 

@@ -24,7 +24,8 @@ from weights_page import write_card
 from meshkit.data import RiggedModel, load_humans, load_shipped
 from meshkit.models import PretrainedTransfer, load_pretrained, pretrained_names
 from meshkit.transfer import Confidence, usual_range
-from meshkit.transfer._prepare import open_mesh, prepare
+from meshkit.transfer._open import open_mesh
+from meshkit.transfer._prepare import prepare
 from meshkit.transfer.confidence import bounds, roughness
 from meshkit.transfer.transfer import run_network
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from meshkit.models import PretrainedTransfer, load_generator, load_pretrained, pretrained_names
-from meshkit.transfer._prepare import OpenedMesh
+from meshkit.transfer._open import OpenedMesh
 
 __all__ = ["Choice", "Weights", "choose_weights", "load_weights"]
 

@@ -16,8 +16,9 @@ from meshkit.io import MeshFileError, SurfaceBinding
 from meshkit.io._binary_readers import read_scene
 from meshkit.transfer._choose import Weights
 from meshkit.transfer._frames import turns_about
+from meshkit.transfer._open import Mesh, examine, named, read
 from meshkit.transfer._orient import find_rotation
-from meshkit.transfer._prepare import Mesh, Prepared, axes_doubt, examine, named, read
+from meshkit.transfer._prepare import Prepared, axes_doubt
 from meshkit.transfer.report import TransferResult
 from meshkit.transfer.transfer import PoseTransfer
 
