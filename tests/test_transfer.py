@@ -33,6 +33,7 @@ from meshkit.transfer import (
     PoseTransfer,
     _kinds,
     read_sequence,
+    save_page,
     save_picture,
     transfer_pose,
     transfer_sequence,
@@ -824,6 +825,20 @@ def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypa
     report = replace(result.report, warnings=("odd",) * count)
     save_picture(tmp_path / "x.png", [replace(result, report=report)], size=20)
     assert seen[0][2] == (f"{said} the report" if said else "")
+
+
+def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, monkeypatch):
+    notes = []
+    monkeypatch.setattr("meshkit.transfer.output.save_html", lambda *_, **options: notes.extend(options["notes"]))
+    result = transfer_pose(person, mover, weights=copier(), **UPRIGHT)
+    numbers = Confidence(0.9, 0.1, 0.1, None, None, 0.2, 0.3)
+    limits = {name: {"median": 0.1, "limit": 0.15} for name in ("match_spread", "mutual_share", "pose_roughness")}
+    texts = ("pose: axes in doubt (up +z, facing -y): give them if they are wrong", *numbers.warnings(limits))
+    save_page(tmp_path / "x.html", replace(result, report=replace(result.report, warnings=texts)))
+    assert notes[2] == (
+        "pose: axes in doubt; the network is unsure which places of the two meshes correspond, so limbs may go astray; "
+        "few vertices of the two meshes are each other's best match; the pose mesh's surface is rough"
+    )
 
 
 def test_one_hole_is_a_hole(person, mover):
