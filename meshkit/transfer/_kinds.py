@@ -80,7 +80,9 @@ def rest_body(kind: str) -> tuple[Tensor, Tensor]:
 def guess_kind(verts: Tensor, faces: Tensor) -> Likeness:
     """Whether a mesh is more like a person or an animal, how much more, and how far it is from both.
 
-    DOC
+    Decided by the nearer mean in Mahalanobis distance; where that is not clear the kind is ``"humans"``. The largest
+    distance over the 756 training meshes that the numbers were fitted to (``python tools/fit_kinds.py``) was 6.0 for
+    animals and 3.2 for people; a sphere, a box and a sheet have 14 and more. ``--check`` measures other meshes.
 
     Args:
         verts: (V, 3) one surface, closed or nearly so, of a thousand vertices or so.

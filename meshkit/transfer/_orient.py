@@ -20,7 +20,7 @@ __all__ = ["RestBody", "agreements", "agrees", "choose", "find_rotation"]
 DOUBT = 0.08
 """Lead in score below which an orientation that was found is in doubt."""
 
-AGREEMENT = 0.38
+AGREEMENT = 0.25
 """Correlation of normals below which an orientation that was given is in doubt."""
 
 _CLEAR = 0.05  # score by which another orientation must beat the usual ones
