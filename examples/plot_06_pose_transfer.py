@@ -174,8 +174,8 @@ show(
 # %%
 # In and out of what the weights know
 # -----------------------------------
-# Five numbers of each transfer are compared with those of ordinary test pairs. Here the pose of an animal is given to a
-# person: the network answers, as networks do, and the report says that the answer is none.
+# Seven numbers of each transfer are compared with those of ordinary test pairs. Here the pose of an animal is given to
+# a person: the network answers, as networks do, and the report says that the answer is none.
 
 identity = full(person, own_pose)[0]
 wrong = transfer_pose((identity, full.faces), (pose, animals.faces), weights="corenet3d-humans", **axes)

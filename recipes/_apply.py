@@ -16,7 +16,7 @@ from meshkit.batching import bounding_box_center, center
 from meshkit.descriptors import intrinsic_descriptors
 from meshkit.io import MeshFileError, load_mesh, save_mesh
 from meshkit.models import GeneratorConfig, load_generator
-from meshkit.models.pretrained import check_extent
+from meshkit.models.pretrained import check_extent, extents
 
 FROM_1_TO_2 = ("humans", "animals", "smpl", "smal", "faust")
 """Kinds of --data whose bodies are about 1 to 2 long, in metres or units; meshes of folders may be of any size."""
@@ -34,7 +34,7 @@ def apply(folder: Path, files: tuple[Path, Path], result: Path) -> None:
         for path, (verts, _) in zip(files, meshes, strict=True):
             if kind in FROM_1_TO_2:
                 other = shlex.join(["meshkit-transfer", *map(str, files), "--weights", str(folder)])
-                check_extent(float(extent(verts).max()), str(path), advice=f"`{other}` guesses unit and axes")
+                check_extent(verts, str(path), advice=f"`{other}` guesses unit and axes")
             if model.architecture == "matching" and model.extractor == "setconv" and len(verts) < model.k:
                 raise UserError(f"{path}: {len(verts)} vertices; this model looks at {model.k} neighbours")
         descriptors: list[Tensor] | list[None] = [None, None]
@@ -62,14 +62,10 @@ def trained_on(folder: Path) -> str:
         return ""
 
 
-def extent(verts: Tensor) -> Tensor:
-    return verts.amax(0) - verts.amin(0)
-
-
 def warn(path: Path, verts: Tensor, kind: str) -> None:
     """Speak up where a mesh is unlike the bodies a model was trained on."""
-    tallest = float(extent(verts).max())
-    axis = "xyz"[int(extent(verts).argmax())]
+    tallest = float(extents(verts).max())
+    axis = "xyz"[int(extents(verts).argmax())]
     if kind in FROM_1_TO_2 and not 0.5 <= tallest <= 2.6:
         unit = " metres" if kind in IN_METRES else ""
         print(

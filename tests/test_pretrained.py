@@ -3,7 +3,7 @@
 import importlib
 import json
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from meshkit.descriptors import intrinsic_descriptors
 from meshkit.metrics import pmd
 from meshkit.models import GeneratorConfig, PretrainedTransfer, load_pretrained, pretrained_names
 from meshkit.models.presets import PRESETS
+from meshkit.transfer import Confidence
 
 ROOT = Path(__file__).parents[1]
 PLAIN = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16), residual=True)
@@ -186,7 +187,7 @@ def test_export_and_load_again(exporter, finished_run, bodies, tmp_path, monkeyp
     assert card["figures"] == {"pmd": 50.0, "pmd_copy_identity": 58.0}
     assert card["licence"]["id"] == "Apache-2.0"
     assert len(card["first_pairs_pmd"]) == 8
-    assert set(card["usual"]) == {"match_spread", "mutual_share", "edge_change", "identity_distance", "pose_distance"}
+    assert set(card["usual"]) == {field.name for field in fields(Confidence)}
     text = (weights / "tiny-humans.md").read_text()
     assert card["command"] in text and "Apache-2.0" in text
 

@@ -27,20 +27,24 @@ from meshkit.io import MeshFileError, load_mesh, save_mesh
 from meshkit.metrics import pmd
 from meshkit.models import GeneratorConfig, GeneratorOutput, PretrainedTransfer, pretrained_names
 from meshkit.ot import sinkhorn
+from meshkit.topology import vertex_normals
 from meshkit.transfer import (
     Confidence,
     PoseTransfer,
+    _kinds,
     read_sequence,
+    save_page,
     save_picture,
     transfer_pose,
     transfer_sequence,
     usual_range,
 )
-from meshkit.transfer._frames import axis_name, axis_vector, find_scale, rotations, turn_up, turns_about
-from meshkit.transfer._kinds import guess_kind
-from meshkit.transfer._prepare import named, open_mesh
+from meshkit.transfer._frames import axis_name, axis_vector, rotations, turn_up, turns_about
+from meshkit.transfer._kinds import Likeness, guess_kind
+from meshkit.transfer._open import named, open_mesh
+from meshkit.transfer._units import find_scale, scale_to
 from meshkit.transfer.command import main, parser
-from meshkit.transfer.confidence import row_entropies
+from meshkit.transfer.confidence import roughness, row_entropies
 
 UPRIGHT = {"identity_up": "+z", "identity_facing": "-y", "pose_up": "+z", "pose_facing": "-y"}
 Mesh = tuple[Tensor, Tensor]
@@ -238,10 +242,27 @@ def test_unusual_numbers_are_put_into_words():
     assert Confidence(0.5, 0.5, 0.1, 0.2, 9.0).warnings(usual) == ()
     assert Confidence(None, None, 0.1, None, None).warnings(usual) == ()
     (text,) = Confidence(0.5, 0.1, 0.1, 0.2, None).warnings(usual)
-    assert text == "few vertices match both ways: 10.0%; median 50.0%, 99 of 100 above 50.0%"
+    assert text.startswith(
+        "few vertices of the two meshes are each other's best match: 10.0% (median 50.0%, 99 of 100 "
+    )
+    assert text.endswith(
+        "above 50.0%); see that both are bodies of the kind that the weights know, and that their axes are right"
+    )
     (text,) = Confidence(0.5, 0.5, 0.1, 0.3, None).warnings(usual)
-    assert text == "the identity mesh is unlike the training meshes: 0.300; median 0.200, 99 of 100 below 0.200"
+    assert text.startswith(
+        "the identity mesh's surface is unlike that of the training meshes: 0.300 (median 0.200, 99 of"
+    )
+    (text,) = Confidence(1.0, 0.5, 0.1, 0.2, None).warnings(usual)
+    assert text.startswith(
+        "the network is unsure which places of the two meshes correspond, so limbs may go astray; on "
+    )
+    assert "matches a vertex with this share of the pose mesh: 100.0% (median 50.0%" in text
     assert len(Confidence(2.0, 0.1, 0.9, 0.9, None).warnings(usual)) == 4
+    rough = usual_range([Confidence(None, None, 0.1, None, None, 0.1, 0.1 + 0.001 * i) for i in range(101)])
+    assert rough["pose_roughness"] == {"median": 0.15, "limit": 0.199} and "match_spread" not in rough
+    texts = Confidence(None, None, 0.1, None, None, 0.2, 0.3).warnings(rough)
+    assert [text[:25] for text in texts] == ["the identity mesh's surfa", "the pose mesh's surface i"]
+    assert all("is rough" in text and "smooth the mesh first" in text for text in texts)
     with pytest.raises(ValueError, match="needs measured pairs"):
         usual_range([])
 
@@ -252,11 +273,31 @@ def test_the_report_says_what_was_done(person, mover):
     )
     text = str(result.report)
     assert "simplified to 1000 vertices" in text and "frame    up +z, facing -y (given)" in text
-    assert "UNUSUAL  edges change their length much: 0.0%" in text
+    assert "UNUSUAL  the network changes the identity's edges much in length: 0.0%" in text
     assert result.report.confidence.edge_change == pytest.approx(0, abs=1e-5)
     assert result.report.confidence.identity_distance is None
     assert "do not say what is usual" in str(transfer_pose(person, mover, weights=copier(), **UPRIGHT).report)
     assert "all within what is usual" in str(transfer_pose(person, mover, weights=copier(usual=WIDE), **UPRIGHT).report)
+
+
+def test_roughness_is_that_of_the_angles():
+    grid = torch.cartesian_prod(torch.arange(3.0), torch.arange(3.0))
+    flat = torch.cat([grid, torch.zeros(9, 1)], 1)
+    faces = torch.tensor([[0, 3, 1], [1, 3, 4], [3, 6, 4], [4, 6, 7], [1, 4, 2], [2, 4, 5], [4, 7, 5], [5, 7, 8]])
+    assert roughness(flat, faces) == pytest.approx(0, abs=1e-6)
+    assert roughness(flat, torch.cat([faces, torch.tensor([[0, 1, 2]])])) == pytest.approx(0, abs=1e-6)  # no area
+    cube = trimesh.creation.box()
+    points, triangles = torch.tensor(cube.vertices), torch.tensor(cube.faces)
+    normals = vertex_normals(points, triangles)
+    expected = [1 - float(normals[i] @ torch.tensor(cube.face_normals[f])) for f in range(12) for i in triangles[f]]
+    assert roughness(points, triangles) == pytest.approx(sum(expected) / 36, rel=1e-6)
+    body = body_of(6890, 3, 10)
+    noise = torch.randn(body[0].shape, generator=torch.Generator().manual_seed(0))
+    levels = []
+    for size in (0.0, 0.005, 0.01):
+        small = open_mesh((body[0] + size * noise, body[1]), "x").simplified(1000)
+        levels.append(roughness(small.verts, small.faces))
+    assert 0.09 < levels[0] < 0.15 < levels[1] < 0.2 < levels[2]
 
 
 # People and animals
@@ -267,37 +308,83 @@ def test_people_and_animals_are_told_apart():
         body, split = load_shipped(kind)
         for who, pose in itertools.product(split.test_identities[:4].tolist(), poses):
             verts = body(torch.tensor([who]), torch.tensor([pose]))[0]
-            assert guess_kind(30 * y_up(verts), body.faces) == (kind, True)
+            like = guess_kind(30 * y_up(verts), body.faces)
+            assert (like.kind, like.clear, like.doubt) == (kind, True, "")
 
 
 @pytest.mark.parametrize(("resolution", "who"), [(2000, 24), (2000, 40), (2000, 72), (3445, 172), (6890, 168)])
 def test_bodies_once_taken_for_animals_are_people(resolution, who):
     small = open_mesh(body_of(resolution, who, 10), "identity")
-    assert small.likeness == ("humans", True)
+    assert (small.likeness.kind, small.likeness.clear) == ("humans", True)
 
 
 def test_a_shape_between_the_kinds_is_taken_for_a_person_in_doubt(person, monkeypatch):
-    monkeypatch.setattr("meshkit.transfer._kinds.shape_numbers", lambda *_: torch.zeros(8))
-    monkeypatch.setattr("meshkit.transfer._kinds._OFFSET", 0.1)
-    assert guess_kind(*person) == ("humans", False)
+    between = torch.tensor(_kinds._MEANS).double().mean(0)
+    monkeypatch.setattr(_kinds, "shape_numbers", lambda *_: between)
+    like = guess_kind(*person)
+    assert (like.kind, like.clear, like.neither) == ("humans", False, False)
+    assert like.score == pytest.approx(0, abs=1e-6)
     monkeypatch.setattr(choose, "pretrained_names", lambda: ["a", "b"])
     cards = {"a": "humans", "b": "animals"}
     monkeypatch.setattr(
         choose, "load_pretrained", lambda name: copier(name=name, data=cards[name], figures={"pmd": 1.0}, usual=WIDE)
     )
     result = transfer_pose(person, person, **UPRIGHT)
-    assert result.report.warnings == (
-        "the identity's shape is between humans' and animals': humans were assumed; name the weights",
-    )
+    said = "mesh has a shape between a person's and an animal's: name the weights of its kind if these are not"
+    assert result.report.warnings == (f"the identity {said}", f"the pose {said}")
     text = str(result.report)
-    assert "UNUSUAL  the identity's shape is between" in text and "all within" not in text
+    assert "UNUSUAL  the identity mesh has a shape between" in text and "all within" not in text
+    assert "weights  a, those for humans, as the identity's shape is unclear" in text
+    assert text.count("unit unknown, scaled by ") == 2 and "if this is a body" not in text
+
+
+def blob(kind: str) -> Mesh:
+    if kind == "ball":
+        mesh = trimesh.creation.icosphere(4)
+    else:
+        mesh = trimesh.creation.box((1, 1, 1 if kind == "box" else 0.01))
+        for _ in range(4):
+            mesh = mesh.subdivide()
+    return torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces).long()
+
+
+@pytest.mark.parametrize("kind", ["ball", "box", "sheet"])
+def test_what_is_no_body_is_neither_and_of_no_unit(kind, person):
+    mesh = blob(kind)
+    assert open_mesh(mesh, "x").likeness.neither
+    net = copier(data="humans", usual=WIDE)
+    for role, pair in (("identity", (mesh, person)), ("pose", (person, mesh))):
+        report = transfer_pose(*pair, weights=net, **UPRIGHT).report
+        (said,) = report.warnings
+        assert said.startswith(f"the {role} mesh has the shape of neither a person nor a four-legged animal (distance ")
+        assert "expect no sensible result; use one surface that is a body" in said
+        prepared = getattr(report, role)
+        assert prepared.scale.unit == "unknown" and "unit unknown, scaled by " in str(prepared)
+        assert "if this is a body" not in str(report) and "guessed" not in str(prepared)
+        area = float(_kinds.surface_area(prepared.clean.verts, prepared.clean.faces))
+        assert area == pytest.approx(float(_kinds.surface_area(*_kinds.rest_body("humans"))), rel=1e-3)
+    given = transfer_pose(person, mesh, weights=net, pose_unit="cm", **UPRIGHT).report
+    assert given.pose.scale.unit == "cm"
+
+
+def test_a_mesh_of_no_unit_keeps_its_size(person):
+    """In its own frame; in that of a mesh of a known unit it is as large as the bodies that the weights know."""
+    mesh = blob("ball")
+    net = copier(data="humans")
+    same = transfer_pose(mesh, person, weights=net, frame="identity", refine=False, **UPRIGHT).verts
+    assert_near(same - standing_point(same), mesh[0] - standing_point(mesh[0]), 1e-4)
+    other = transfer_pose(mesh, person, weights=net, refine=False, **UPRIGHT).verts
+    factor = scale_to(float(_kinds.surface_area(*mesh)), float(_kinds.surface_area(*_kinds.rest_body("humans")))).factor
+    assert_near(other - standing_point(other), factor * (mesh[0] - standing_point(mesh[0])), 1e-3)
 
 
 def test_a_pose_mesh_of_the_other_kind_is_told(person):
     animals = load_animals()
     net = copier(data="humans", usual=WIDE)
     report = transfer_pose(person, (animals.template, animals.faces), weights=net, **UPRIGHT).report
-    assert "these weights are for humans, but the pose mesh has the shape of animals" in report.warnings
+    said = "these weights are for humans, but the pose mesh has the shape of animals: use weights of its kind"
+    assert report.warnings == (said,)
+    assert report.pose.scale.unit == "unknown"
     assert transfer_pose(person, person, weights=net, **UPRIGHT).report.warnings == ()
 
 
@@ -306,9 +393,9 @@ def test_the_kind_is_looked_at_once_and_where_it_counts(person, monkeypatch):
 
     def look(verts, _):
         looked.append(len(verts))
-        return "humans", True
+        return Likeness("humans", -1.0, 1.0)
 
-    monkeypatch.setattr("meshkit.transfer._prepare.guess_kind", look)
+    monkeypatch.setattr("meshkit.transfer._open.guess_kind", look)
     monkeypatch.setattr(choose, "pretrained_names", lambda: ["a"])
     monkeypatch.setattr(choose, "load_pretrained", lambda _: copier(name="a", data="humans", figures={"pmd": 1.0}))
     transfer_pose(person, person, **UPRIGHT)
@@ -323,12 +410,12 @@ def test_doubt_of_size_and_axes_is_a_warning(person, monkeypatch):
     odd = (3 * person[0], person[1])
     (text,) = transfer_pose(odd, person, weights=net, identity_unit="m", **UPRIGHT).report.warnings
     assert text.startswith("identity: far from the size of the training bodies in the unit given, m: scaled by 0.3")
-    for lead, warned in ((0.01, True), (0.2, False)):
-        monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, lead=lead, **__: (torch.eye(3), lead))
+    for clear in (False, True):
+        monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, c=clear, **__: (torch.eye(3), c))
         report = transfer_pose(person, person, weights=net, identity_up="+z", pose_up="+z").report
         text = "pose: axes in doubt (up +z, facing -y): give them if they are wrong"
-        assert (text in report.warnings) == warned
-        assert ("all within" in str(report)) != warned
+        assert (text in report.warnings) != clear
+        assert ("all within" in str(report)) == clear
 
 
 def test_auto_takes_the_best_weights_of_the_kind(person, monkeypatch):
@@ -339,8 +426,7 @@ def test_auto_takes_the_best_weights_of_the_kind(person, monkeypatch):
         "load_pretrained",
         lambda name, **_: copier(name=name, data=cards[name][0], figures={"pmd": cards[name][1]}),
     )
-    net, why, doubts = choose.choose_weights("auto", lambda: open_mesh(person, "identity"))
-    assert doubts == ()
+    net, why = choose.choose_weights("auto", lambda: open_mesh(person, "identity"))
     assert net.card["name"] == "b" and "shape is that of humans" in why
     animals = load_animals()
     animal = open_mesh((animals.template, animals.faces), "identity")
@@ -511,7 +597,8 @@ def test_a_sequence_is_as_its_poses_one_by_one(person, moves):
 def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
     looked = []
     monkeypatch.setattr(
-        "meshkit.transfer._prepare.guess_kind", lambda verts, _: looked.append(len(verts)) or ("animals", True)
+        "meshkit.transfer._open.guess_kind",
+        lambda verts, _: looked.append(len(verts)) or Likeness("animals", 1.0, 1.0),
     )
     poses = [(v, moves[1]) for v in moves[0]]
     results = list(transfer_sequence(person, poses, weights=copier(data="humans"), **UPRIGHT))
@@ -522,13 +609,35 @@ def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
 def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatch):
     net = copier(data="humans", usual=WIDE)
     net.generator.match = None  # find_rotation, which would call it, is replaced
-    monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, **__: (torch.eye(3), 0.2))
-    leads = iter((0.01, 0.2))
-    monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), next(leads)))
+    monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, **__: (torch.eye(3), True))
+    clear = iter((False, True))
+    monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), next(clear)))
     axes = {name: axis for name, axis in UPRIGHT.items() if name != "pose_facing"}
     results = transfer_sequence(person, [(v, moves[1]) for v in moves[0]], weights=net, **axes)
     said = "pose 1: axes in doubt (up +z, facing -y): give them if they are wrong"
     assert [result.report.warnings for result in results] == [(), (said,), ()]
+
+
+def test_doubt_about_the_first_poses_axes_is_not_said_of_later_ones(person, moves, monkeypatch):
+    net = copier(data="humans", usual=WIDE)
+    net.generator.match = None
+    monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, **__: (torch.eye(3), False))
+    monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), True))
+    axes = {name: axis for name, axis in UPRIGHT.items() if name != "pose_facing"}
+    results = transfer_sequence(person, [(v, moves[1]) for v in moves[0]], weights=net, **axes)
+    assert [len(result.report.warnings) for result in results] == [1, 0, 0]
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_the_command_says_each_doubt_once(quiet, person, moves, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data="humans", usual=WIDE))
+    save_mesh(tmp_path / "id.obj", 3 * person[0], person[1])
+    np.savez(tmp_path / "moves.npz", verts=moves[0].numpy(), faces=moves[1].numpy())
+    axes = ["--identity-up=+z", "--identity-facing=-y", "--pose-up=+z", "--pose-facing=-y", "--identity-unit=m"]
+    words = [*axes, "--weights", "copy", "--no-picture", "--no-html", *(["--quiet"] if quiet else [])]
+    command(tmp_path / "id.obj", tmp_path / "moves.npz", "-o", tmp_path / "out.npz", *words)
+    said = "".join(capsys.readouterr())
+    assert said.count("far from the size of the training bodies") == 1
 
 
 def test_what_the_reader_says_of_the_first_pose_is_kept(person, moves, tmp_path):
@@ -562,6 +671,7 @@ def command(*words: object) -> None:
     ("words", "message"),
     [
         (["none.obj", "id.obj"], "none.obj: no such file"),
+        (["id.obj", "none.obj"], "none.obj: no such file"),
         (["id.obj", "id.obj", "-o", "x.txt"], "the result is written as .obj"),
         (["id.obj", "id.obj", "-o", "x.npz"], "the result is written as .obj"),
         (["id.obj", "id.obj", "-o", "id.obj"], "would overwrite an input"),
@@ -717,6 +827,20 @@ def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypa
     assert seen[0][2] == (f"{said} the report" if said else "")
 
 
+def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, monkeypatch):
+    notes = []
+    monkeypatch.setattr("meshkit.transfer.output.save_html", lambda *_, **options: notes.extend(options["notes"]))
+    result = transfer_pose(person, mover, weights=copier(), **UPRIGHT)
+    numbers = Confidence(0.9, 0.1, 0.1, None, None, 0.2, 0.3)
+    limits = {name: {"median": 0.1, "limit": 0.15} for name in ("match_spread", "mutual_share", "pose_roughness")}
+    texts = ("pose: axes in doubt (up +z, facing -y): give them if they are wrong", *numbers.warnings(limits))
+    save_page(tmp_path / "x.html", replace(result, report=replace(result.report, warnings=texts)))
+    assert notes[2] == (
+        "pose: axes in doubt; the network is unsure which places of the two meshes correspond, so limbs may go astray; "
+        "few vertices of the two meshes are each other's best match; the pose mesh's surface is rough"
+    )
+
+
 def test_one_hole_is_a_hole(person, mover):
     verts, faces = person
     report = transfer_pose((verts, faces[1:]), mover, weights=copier(), **UPRIGHT).report
@@ -805,8 +929,42 @@ def test_strangers_are_reported(fine_transfer):
     for blob in (points, bumps):
         warnings = transfer((blob, torch.tensor(ball.faces)), **upright, pose_unit="m").report.warnings
         assert sum("99 of 100" in text for text in warnings) >= 3, warnings
-    # The matching stands the noise; the surface becomes so large that no body has it.
-    assert any("far from the size" in text for text in transfer((pose[0] + noise, pose[1]), **upright).report.warnings)
+    rough = transfer((pose[0] + noise, pose[1]), **upright).report.warnings
+    assert any("the pose mesh's surface is rough" in text for text in rough), rough
+
+
+@pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
+def test_wrong_axes_are_noticed_where_they_were_given(fine_transfer):
+    transfer, pose, _ = fine_transfer
+    assert not transfer(pose, pose_up="+z", pose_facing="-y").report.warnings
+    noticed = 0
+    for up, facing in (("+y", "+z"), ("+z", "+x"), ("-z", "-y")):
+        warnings = transfer(pose, pose_up=up, pose_facing=facing).report.warnings
+        said = f"pose: the axes given (up {up}, facing {facing}) seem wrong: leave them out to have them found"
+        noticed += said in warnings
+    assert noticed >= 1
+
+
+def test_the_rest_body_is_described_and_encoded_once(person, mover, monkeypatch):
+    config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16))
+    net = PretrainedTransfer(config.build(), config, card={"data": "humans", "vertices": 1000}).eval()
+    sizes = []
+    encode = net.generator.encode
+    monkeypatch.setattr(net.generator, "encode", lambda verts, **_: sizes.append(verts) or encode(verts, **_))
+    rest = _kinds.rest_body("humans")[0]
+    transfer = PoseTransfer(person, weights=net, refine=False, identity_up="+z")
+    for _ in range(2):
+        transfer(mover, pose_up="+z")
+    same = [verts for verts in sizes if verts.shape[1] == len(rest) and torch.allclose(verts[0], center(rest[None])[0])]
+    assert len(same) == 1 and len(sizes) > 12
+
+
+@pytest.mark.skipif("xdualnet-animals" not in pretrained_names(), reason="this checkout lacks the weights")
+def test_an_animal_in_meshkits_own_frame_is_not_in_doubt():
+    body = load_shipped("animals")[0]
+    verts = body(torch.tensor([0]), torch.tensor([0]))[0]
+    identity = PoseTransfer((verts, body.faces), weights="xdualnet-animals").identity
+    assert torch.equal(identity.rotation, torch.eye(3)) and identity.doubts == ()
 
 
 @pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")

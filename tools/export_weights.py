@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from measure_usual import PAIRS, measure, usual_section
+from measure_usual import PAIRS, measure
 from safetensors.torch import save_file
+from weights_page import LENGTHS, UNITS, write_card
 
 from meshkit.batching import center
 from meshkit.data import load_shipped
@@ -39,17 +40,6 @@ SYSTEMS = {  # by recipe: a setting that no other recipe has, and what the recip
     "cycle_baseline": ("lambda_cycle", "Cycle and self reconstruction (unsupervised)"),
     "npt": ("variant", "NPT (supervised)"),
     "corenet3d": ("norm", "3D-CoreNet (supervised)"),
-}
-UNITS = {
-    "humans": ("metres", "m"),
-    "animals": (
-        "the unit of the shipped animals, which is arbitrary (a rest bounding box has a diagonal of 1.5 to 2.1)",
-        "units",
-    ),
-}
-LENGTHS = {  # keys of the card that are lengths: only humans are in metres
-    "humans": ("correspondence_m", "largest_distance_m"),
-    "animals": ("correspondence_units", "largest_distance_units"),
 }
 IGNORED = {"preset", "out", "name", "resume", "apply", "result", "threads", "accelerator", "data", "seed", "workers"}
 LICENCES = {
@@ -137,65 +127,6 @@ def differences(preset: dict[str, Any], config: dict[str, Any], prefix: str) -> 
     return words
 
 
-def network(card: dict[str, Any]) -> str:
-    """What the name of the system does not say of its network, as a line of the card."""
-    if card["system"].startswith("3D-CoreNet") and card["model"]["extractor"] == "setconv":
-        return (
-            "- **Network**: with X-DualNet's extractor of set convolutions, as the recipe's; the published one, that\n"
-            "  of `meshkit.models.corenet3d()`, is pointwise.\n"
-        )
-    return ""
-
-
-def markdown(name: str, card: dict[str, Any]) -> str:
-    figures = card["figures"]
-    rows = "\n".join(f"| {key} | {value} |" for key, value in figures.items())
-    machine = card["machine"]
-    processor = machine["gpu"] or machine["processor"]
-    minutes = card["train_minutes"]
-    unit, short = UNITS[card["data"]]
-    moved = card["rounding"][LENGTHS[card["data"]][1]]
-    distance = f"{1e3 * moved:.3f} mm" if short == "m" else f"{moved:.1e} {short}"
-    return f"""# {name}
-
-{card["system"]}, preset `{card["preset"]}`, trained on the {card["data"]} that ship with meshkit.
-
-```python
-import torch
-from meshkit.models import load_pretrained
-
-net = load_pretrained("{name}")
-posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces)  # (V, 3)
-```
-
-- **Input**: two meshes, z up, facing -y, around {card["vertices"]} vertices each, in {unit};
-  `meshkit.transfer` brings others there.
-{network(card)}- **Training**: `{card["command"]}`
-  ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor}, {card["precision"]}, torch
-  {machine["torch"]}), finished on {card["date"]}.
-- **Split**: {card["split"]}
-- **Size**: {card["parameters"]:,} parameters, those of the residual blocks stored with 16 bits. Rounding them moves no
-  vertex of {card["rounding"]["pairs"]} test pairs by more than {distance}.
-- **Licence**: {card["licence"]["id"]}. {card["licence"]["note"]}
-
-## Figures
-
-Means over the first {card["test_pairs"]} fixed test pairs, by the network as it was trained, not rounded.
-Units: {card["units"]}. `copy_identity` and `copy_warped` are what the unchanged
-identity and the warped mesh would score.
-
-| figure | value |
-|---|---:|
-{rows}
-
-{usual_section(card)}
-## Limits
-
-Bodies, poses and animals unlike the training set; several people in one mesh; clothes and hair that are not one surface
-with the body; limbs that touch. Left and right limbs that look alike are sometimes exchanged.
-"""
-
-
 def drawn(config: dict[str, Any]) -> str:
     """What to say of identities that were drawn for the run."""
     count = config.get("sampled_identities", 0)
@@ -261,9 +192,7 @@ def main() -> None:
     with atomic_write(args.out / f"{args.name}.safetensors") as path:
         save_file(state, path)
         path.chmod(0o644)  # safetensors makes files that only their owner can read
-    for suffix, text in ((".json", json.dumps(card, indent=2) + "\n"), (".md", markdown(args.name, card))):
-        with atomic_write(args.out / f"{args.name}{suffix}") as path:
-            path.write_text(text, encoding="utf-8")
+    write_card(args.out, card)
     size = (args.out / f"{args.name}.safetensors").stat().st_size / 1e6
     print(f"{args.name}: {size:.1f} MB, rounding moves vertices by at most {1e3 * distance:.3f} mm")
 

@@ -1,10 +1,11 @@
-"""Fit the discriminant that tells people from animals in meshkit/transfer/_kinds.py, and measure how often it errs.
+"""Fit what tells people, animals and other shapes apart in meshkit/transfer/_kinds.py, and measure how often it errs.
 
     OMP_NUM_THREADS=1 python tools/fit_kinds.py           # from training bodies; prints the numbers to put there
     OMP_NUM_THREADS=1 python tools/fit_kinds.py --check   # every shipped body, by the numbers that stand there
 
-Fisher's linear discriminant with a little shrinkage, on the shape numbers of meshes as ``meshkit.transfer`` simplifies
-them: people of 1000, 2000, 3445 and 6890 vertices; animals as they come and with each face cut into four.
+The means of both kinds and their common covariance, with a little shrinkage, of the shape numbers of meshes as
+``meshkit.transfer`` simplifies them: people of 1000, 2000, 3445 and 6890 vertices; animals as they come and with each
+face cut into four. The nearer mean in Mahalanobis distance decides, which is Fisher's linear discriminant.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import torch
 from measure_usual import mesh_sources
 
 from meshkit.data import load_shipped
-from meshkit.transfer._kinds import _CLEAR, kind_score, shape_numbers
-from meshkit.transfer._prepare import open_mesh
+from meshkit.transfer._kinds import guess_kind, shape_numbers
+from meshkit.transfer._open import open_mesh
 
 SHRINKAGE = 1e-3  # variance added to every number; they vary by 0.01 to 0.1 within a kind
 POSES = {"humans": 1, "animals": 6}  # drawn for each body and resolution, to check
@@ -37,16 +38,17 @@ def fit() -> None:
             rows.append(shape_numbers(small.verts, small.faces))
         groups.append(torch.stack(rows))
         print(f"{kind}: {len(rows)} meshes of {len(split.train_identities)} bodies")
-    people, animals = groups
-    spread = (torch.cov(people.T) + torch.cov(animals.T)) / 2 + SHRINKAGE * torch.eye(people.shape[1]).double()
-    gap = animals.mean(0) - people.mean(0)
-    weights = torch.linalg.solve(spread, gap)
-    weights = 2 * weights / (weights @ gap)  # the means come to lie at -1 and 1
-    offset = -float(weights @ (animals.mean(0) + people.mean(0))) / 2
-    print(f"_WEIGHTS = ({', '.join(f'{weight:.3f}' for weight in weights)})\n_OFFSET = {offset:.3f}")
+    spread = sum(torch.cov(rows.T) for rows in groups) / 2 + SHRINKAGE * torch.eye(groups[0].shape[1]).double()
+    whitening = torch.linalg.inv(torch.linalg.cholesky(spread))
+    print("_MEANS = (\n" + "".join(f"    {_row(rows.mean(0))},\n" for rows in groups) + ")")
+    print("_WHITENING = (\n" + "".join(f"    {_row(row)},\n" for row in whitening) + ")")
     for name, rows in zip(SIDE, groups, strict=True):
-        scores = rows @ weights + offset
-        print(f"{name}: scores {scores.min():.2f} to {scores.max():.2f}")
+        far = ((rows - rows.mean(0)) @ whitening.T).norm(dim=1)
+        print(f"{name}: distances from their mean to {far.max():.2f}, median {far.median():.2f}")
+
+
+def _row(numbers: torch.Tensor) -> str:
+    return f"({', '.join(f'{number:.3f}' for number in numbers)})"
 
 
 def check(kinds: list[str]) -> None:
@@ -55,20 +57,24 @@ def check(kinds: list[str]) -> None:
         side = SIDE[kind]
         body, split = load_shipped(kind)
         unseen = set(split.test_identities.tolist())
-        count, least = Counter[str](), {"training": 9.0, "unseen": 9.0}
+        count = Counter[str]()
+        least, most = {"training": 9.0, "unseen": 9.0}, {"training": 0.0, "unseen": 0.0}
         for source in mesh_sources(kind, 1):
             for identity in range(len(body.identities)):
                 for pose in draw.choice(len(body.poses), POSES[kind], replace=False).tolist():
                     small = open_mesh(source(identity, pose), kind).simplified(1000)
-                    score = side * kind_score(shape_numbers(small.verts, small.faces))
+                    like = guess_kind(small.verts, small.faces)
+                    score = side * like.score
                     group = "unseen" if identity in unseen else "training"
                     count[group] += 1
                     count[f"{group} wrong"] += score <= 0
-                    count[f"{group} unclear"] += abs(score) < _CLEAR
-                    least[group] = min(least[group], score)
+                    count[f"{group} unclear"] += not like.clear
+                    count[f"{group} neither"] += like.neither
+                    least[group], most[group] = min(least[group], score), max(most[group], like.distance)
         for group, margin in least.items():
-            wrong, unclear = count[f"{group} wrong"], count[f"{group} unclear"]
-            print(f"{kind}, {group}: {count[group]} meshes, {wrong} wrong, {unclear} unclear, least score {margin:.2f}")
+            wrong, unclear, neither = (count[f"{group} {word}"] for word in ("wrong", "unclear", "neither"))
+            print(f"{kind}, {group}: {count[group]} meshes, {wrong} wrong, {unclear} unclear ({neither} as neither),")
+            print(f"    least score {margin:.2f}, largest distance {most[group]:.2f}")
 
 
 def main() -> None:

@@ -5,28 +5,28 @@
 
 Unseen bodies in unseen poses are given as any mesh is: at several vertex counts, mixed, cleaned and simplified by
 ``meshkit.transfer``, their axes given. Median and limit of each number go to meshkit/weights/NAME.json and NAME.md.
-``--check`` draws other pairs and counts how many of them the limits in the cards flag.
+``--check`` draws other pairs and counts how many of them the limits in the cards flag. ``--roughness`` measures that
+alone, which takes no network; the other numbers in the cards stay.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 import trimesh
+from weights_page import write_card
 
 from meshkit.data import RiggedModel, load_humans, load_shipped
-from meshkit.io import atomic_write
 from meshkit.models import PretrainedTransfer, load_pretrained, pretrained_names
 from meshkit.transfer import Confidence, usual_range
-from meshkit.transfer._prepare import open_mesh, prepare
+from meshkit.transfer._open import open_mesh
+from meshkit.transfer._prepare import prepare
+from meshkit.transfer.confidence import bounds, roughness
 from meshkit.transfer.transfer import run_network
 
 WEIGHTS = Path(__file__).parents[1] / "meshkit" / "weights"
@@ -49,6 +49,16 @@ def measure(
         for net, numbers in zip(nets, measured, strict=True):
             numbers.append(run_network(net, own, other)[1])
     return measured
+
+
+def measure_roughness(kind: str, num_verts: int, pairs: int, seed: int) -> dict[str, list[float]]:
+    """The roughness alone of the meshes that :func:`measure` takes."""
+    found: dict[str, list[float]] = {"identity_roughness": [], "pose_roughness": []}
+    for meshes in draw_pairs(kind, num_verts, pairs, seed):
+        for mesh, values in zip(meshes, found.values(), strict=True):
+            simple = open_mesh(mesh, kind).simplified(num_verts)
+            values.append(roughness(simple.verts, simple.faces))
+    return found
 
 
 def draw_pairs(kind: str, num_verts: int, pairs: int, seed: int) -> Iterator[tuple[Mesh, Mesh]]:
@@ -81,63 +91,48 @@ def quartered(body: RiggedModel, identity: int, pose: int) -> Mesh:
     return torch.from_numpy(points).float(), torch.from_numpy(triangles).long()
 
 
-def described(kind: str) -> str:
-    """The meshes that were measured on, for the cards."""
-    if kind == "humans":
-        return "given at 1000, 2000, 3445 and 6890 vertices"
-    return "given as they are shipped, and with each face cut into four"
-
-
-def usual_section(card: dict[str, Any]) -> str:
-    """The section of a card's page that says what is usual."""
-    rows = "\n".join(f"| {key} | {v['median']} | {v['limit']} |" for key, v in card["usual"].items())
-    return f"""## What is usual
-
-Over {card["usual_pairs"]} pairs of unseen bodies in unseen poses, {described(card["data"])},
-mixed, and made ready by `meshkit.transfer` (`tools/measure_usual.py`). A transfer is called unusual when a number lies
-beyond the limit (99 of 100 of these pairs lie within); `meshkit.transfer.Confidence` says what the numbers are.
-
-| number | median | limit |
-|---|---:|---:|
-{rows}
-"""
-
-
-def write_card(folder: Path, name: str, usual: dict[str, dict[str, float]], pairs: int) -> None:
-    """Put what is usual into the card of shipped weights, data and page."""
-    card = json.loads((folder / f"{name}.json").read_text(encoding="utf-8")) | {"usual": usual, "usual_pairs": pairs}
-    page = (folder / f"{name}.md").read_text(encoding="utf-8")
-    new_page, found = re.subn(r"## What is usual\n.*?\n(?=\n## )", lambda _: usual_section(card), page, flags=re.DOTALL)
-    if found != 1:
-        raise SystemExit(f"error: {name}.md has no section 'What is usual' to replace")
-    for suffix, text in ((".json", json.dumps(card, indent=2) + "\n"), (".md", new_page)):
-        with atomic_write(folder / f"{name}{suffix}") as path:
-            path.write_text(text, encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="+", choices=pretrained_names(), help="weights of one kind of bodies")
     parser.add_argument("--pairs", type=int, default=PAIRS)
     parser.add_argument("--check", action="store_true", help="count what is flagged among other pairs; write nothing")
+    parser.add_argument("--roughness", action="store_true", help="this number alone")
     args = parser.parse_args()
     nets = [load_pretrained(name) for name in args.names]
     same = {(net.card["data"], net.card["vertices"], net.config.descriptors, net.config.num_signatures) for net in nets}
     if len(same) != 1:
         raise SystemExit("error: weights measured together must be for the same bodies and take the same descriptors")
     kind, num_verts, *_ = same.pop()
-    for net, name, numbers in zip(
-        nets, args.names, measure(nets, kind, num_verts, args.pairs, seed=1 if args.check else 0), strict=True
-    ):
+    seed = 1 if args.check else 0
+    if args.roughness:
+        rough = measure_roughness(kind, num_verts, args.pairs, seed)
+        usual = {name: bounds(name, values) for name, values in rough.items()}
+        for net in nets:
+            print(f"{net.card['name']}, {args.pairs} pairs")
+            for key, values in rough.items():
+                told(
+                    key,
+                    usual[key],
+                    sum(v > net.card["usual"].get(key, usual[key])["limit"] for v in values),
+                    args.pairs,
+                )
+            if not args.check:
+                write_card(WEIGHTS, net.card | {"usual": net.card["usual"] | usual})
+        return
+    for net, numbers in zip(nets, measure(nets, kind, num_verts, args.pairs, seed), strict=True):
         usual = usual_range(numbers)
-        if not args.check:
-            write_card(WEIGHTS, name, usual, args.pairs)
         flagged = [one.unusual(net.card["usual"]) for one in numbers]
         share = sum(map(bool, flagged)) / len(flagged)
-        print(f"{name}, {args.pairs} pairs; beyond the limits that the card had: {share:.1%} by any number")
-        for key, bounds in usual.items():
-            share = sum(key in names for names in flagged) / len(flagged)
-            print(f"  {key:<18} median {bounds['median']:.4f}  limit {bounds['limit']:.4f}  flagged {share:.1%}")
+        print(f"{net.card['name']}, {args.pairs} pairs; beyond the limits that the card had: {share:.1%} by any number")
+        for key, found in usual.items():
+            told(key, found, sum(key in names for names in flagged), args.pairs)
+        if not args.check:
+            write_card(WEIGHTS, net.card | {"usual": usual, "usual_pairs": args.pairs})
+
+
+def told(name: str, found: dict[str, float], flagged: int, pairs: int) -> None:
+    share = flagged / pairs
+    print(f"  {name:<18} median {found['median']:.4f}  limit {found['limit']:.4f}  flagged {share:.1%}")
 
 
 if __name__ == "__main__":

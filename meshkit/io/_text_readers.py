@@ -18,6 +18,13 @@ _BATCH_LINES = 2**18
 _VERTEX = (b"v ", b"v\t")
 _FACE = (b"f ", b"f\t")
 _SLASHES = re.compile(rb"/\S*")
+_SHOWN = 60  # characters of a line to blame
+_ADVICE = "mend that line, or export the file again"
+_VERTEX_IS = "a vertex is three numbers"
+_OBJ_FACE_IS = "a face is three or more vertex numbers, counted from 1"
+_OFF_FACE_IS = "a face is its number of corners, three or more, and so many vertex numbers, counted from 0"
+_TOO_EARLY = "the file ends too early"
+_Row = tuple[int, bytes]  # the number of a line, and what stands there
 
 
 def fan(polygons: Indices) -> Indices:
@@ -26,6 +33,14 @@ def fan(polygons: Indices) -> Indices:
     steps = np.arange(1, corners - 1)[:, None] + np.array([-1, 0, 1])
     steps[:, 0] = 0
     return polygons[:, steps].reshape(-1, 3)
+
+
+def _blame(number: int, line: bytes, what: str, *, last: bool = False) -> ValueError:
+    """What to raise of a line, counted from 1, that cannot be read: the line, what is wrong, and what to do."""
+    text = line.decode(errors="replace").strip()
+    text = text if len(text) <= _SHOWN else f"{text[:_SHOWN]} ..."
+    advice = "it is the last line, so the file may be cut short: copy or export it again" if last else _ADVICE
+    return ValueError(f"line {number}, {text!r}: {what}; {advice}")
 
 
 class _Growing:
@@ -70,7 +85,7 @@ def read_obj(path: Path, _limit: int) -> Parsed:
             try:
                 _obj_batch(batch, mesh)
             except ValueError:
-                _obj_lines(batch, number, mesh)
+                _obj_lines(batch, number, mesh, ends=stream.tell() == path.stat().st_size)
             number += len(batch)
     if not mesh.count and not any(map(len, mesh.faces)):
         raise ValueError("no vertices and no faces in it")
@@ -96,7 +111,8 @@ def _obj_batch(batch: list[bytes], mesh: _Growing) -> None:
     mesh.add_polygons(polygons - 1)
 
 
-def _obj_lines(batch: list[bytes], start: int, mesh: _Growing) -> None:
+def _obj_lines(batch: list[bytes], start: int, mesh: _Growing, *, ends: bool) -> None:
+    """Line by line; ``start`` lines came before, and ``ends`` says that none come after."""
     whole = b""
     verts: list[list[float]] = []
     polygons: list[list[int]] = []
@@ -106,7 +122,7 @@ def _obj_lines(batch: list[bytes], start: int, mesh: _Growing) -> None:
             whole = whole[:-1] + b" "
             continue
         kind, *fields = whole.split(b"#")[0].split() or [b""]
-        whole = b""
+        read, whole = whole, b""
         try:
             if kind == b"v":
                 x, y, z, *_ = map(float, fields)  # a weight or a colour may follow
@@ -114,11 +130,12 @@ def _obj_lines(batch: list[bytes], start: int, mesh: _Growing) -> None:
             elif kind == b"f":
                 corners = [int(field.split(b"/")[0]) for field in fields]
                 if len(corners) < 3 or 0 in corners:
-                    raise ValueError("a face lists three or more vertices, counted from 1")
+                    raise ValueError
                 # Negative indices count back from the vertices read so far.
                 polygons.append([i - 1 if i > 0 else mesh.count + len(verts) + i for i in corners])
-        except (ValueError, OverflowError) as error:
-            raise ValueError(f"line {number}: {error}") from error
+        except (ValueError, OverflowError):
+            what = _VERTEX_IS if kind == b"v" else _OBJ_FACE_IS
+            raise _blame(number, read, what, last=ends and number == start + len(batch)) from None
     mesh.add_verts(np.array(verts, dtype=float).reshape(-1, 3))
     mesh.add_mixed(polygons)
 
@@ -127,44 +144,66 @@ def read_off(path: Path, _limit: int) -> Parsed:
     """Vertices and faces of an OFF file, with or without colours and normals."""
     mesh = _Growing()
     with path.open("rb") as stream:
-        lines = (content for line in stream if (content := line.split(b"#")[0].strip()))
-        header = next(lines, b"").split()
+        lines = ((n, content) for n, line in enumerate(stream, 1) if (content := line.split(b"#")[0].strip()))
+        number, first = next(lines, (0, b""))
+        header = first.split()
         if not header:
-            raise ValueError("the file ends too early")
+            raise ValueError(_TOO_EARLY)
         if header[0] not in {b"OFF", b"COFF", b"NOFF", b"CNOFF"}:
             raise ValueError(f"the first word is {header[0][:20].decode(errors='replace')!r}, not OFF")
-        counts = header[1:] or next(lines, b"").split()  # the counts may follow the keyword
+        counts = header[1:]
+        if not counts:  # they may follow the keyword
+            number, first = next(lines, (0, b""))
+            counts = first.split()
         if len(counts) < 2:
-            raise ValueError("the file ends too early")
-        vertex_count, face_count, *_ = map(int, counts)
-        _off_rows(lines, vertex_count, lambda rows, _: mesh.add_verts(_table(rows, float, (0, 1, 2))))
-        _off_rows(lines, face_count, lambda rows, first: _off_faces(rows, first, mesh))
+            raise ValueError(_TOO_EARLY)
+        try:
+            vertex_count, face_count, *_ = map(int, counts)
+        except ValueError:
+            raise _blame(number, first, "the numbers of vertices and of faces should stand there") from None
+        _off_rows(lines, vertex_count, lambda rows: _off_verts(rows, mesh))
+        _off_rows(lines, face_count, lambda rows: _off_faces(rows, mesh))
     return mesh.parsed()
 
 
-def _off_rows(lines: Iterator[bytes], count: int, read: Callable[[list[bytes], int], None]) -> None:
+def _off_rows(lines: Iterator[_Row], count: int, read: Callable[[list[_Row]], None]) -> None:
     done = 0
     while done < count:
         rows = list(islice(lines, min(count - done, _BATCH_LINES)))
         if not rows:
-            raise ValueError(f"the file ends too early: {done} of {count} rows are there")
-        read(rows, done)
+            raise ValueError(f"{_TOO_EARLY}: {done} of {count} rows are there; copy or export it again")
+        read(rows)
         done += len(rows)
 
 
-def _off_faces(rows: list[bytes], first: int, mesh: _Growing) -> None:
+def _off_verts(rows: list[_Row], mesh: _Growing) -> None:
     try:
-        table = _table(rows, np.int64, (0, 1, 2, 3))
+        mesh.add_verts(_table([row for _, row in rows], float, (0, 1, 2)))
+    except ValueError:
+        for number, row in rows:
+            try:
+                _, _, _, *_ = map(float, row.split())
+            except ValueError:
+                raise _blame(number, row, _VERTEX_IS) from None
+        raise
+
+
+def _off_faces(rows: list[_Row], mesh: _Growing) -> None:
+    try:
+        table = _table([row for _, row in rows], np.int64, (0, 1, 2, 3))
         if (table[:, 0] == 3).all():
             mesh.add_polygons(table[:, 1:])
             return
     except ValueError:
         pass
     polygons = []
-    for number, row in enumerate(rows, first):
+    for number, row in rows:
         fields = row.split()
-        size, *corners = map(int, fields[: int(fields[0]) + 1])  # a colour may follow
-        if not 3 <= size <= len(corners):
-            raise ValueError(f"face {number} lists {len(corners)} of its {size} vertices")
+        try:
+            size, *corners = map(int, fields[: int(fields[0]) + 1])  # a colour may follow
+            if not 3 <= size <= len(corners):
+                raise ValueError
+        except ValueError:
+            raise _blame(number, row, _OFF_FACE_IS) from None
         polygons.append(corners)
     mesh.add_mixed(polygons)

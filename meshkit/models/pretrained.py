@@ -131,9 +131,8 @@ class PretrainedTransfer(nn.Module):
             raise ValueError(f"{name} must be (V, 3) or (B, V, 3), got {tuple(verts.shape)}")
         verts = (verts if verts.dim() == 3 else verts[None]).to(next(self.generator.parameters()).dtype)
         real = verts.detach() if mask is None else verts.detach()[mask]
-        extent = float((real.flatten(0, -2).amax(0) - real.flatten(0, -2).amin(0)).amax()) if real.numel() else 0.0
         if self.card:
-            check_extent(extent, name, advice="meshkit.transfer.transfer_pose brings others there")
+            check_extent(real, name, advice="meshkit.transfer.transfer_pose brings others there")
         k = self.config.k if self.config.architecture == "matching" and self.config.extractor == "setconv" else 1
         if verts.shape[1] < k:
             raise ValueError(f"{name} has {verts.shape[1]} vertices; these weights look at {k} neighbours of each")
@@ -151,8 +150,15 @@ class PretrainedTransfer(nn.Module):
         return sides
 
 
-def check_extent(extent: float, name: str, *, advice: str) -> None:
+def extents(verts: Tensor) -> Tensor:
+    """Sides (3,) of the box along the axes around all vertices (..., 3); 0 if there are none."""
+    points = verts.reshape(-1, 3)
+    return points.amax(0) - points.amin(0) if len(points) else points.new_zeros(3)
+
+
+def check_extent(verts: Tensor, name: str, *, advice: str) -> None:
     """Refuse a mesh whose longest side cannot be metres; ``advice`` says what can be done with it."""
+    extent = float(extents(verts).amax())
     if not _SMALLEST < extent < _LARGEST:
         raise ValueError(
             f"{name} is {extent:.3g} long, but these weights take meshes of about 1 to 2 (metres, z up, facing -y): "

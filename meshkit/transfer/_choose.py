@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from meshkit.models import PretrainedTransfer, load_generator, load_pretrained, pretrained_names
-from meshkit.transfer._prepare import OpenedMesh
+from meshkit.transfer._open import OpenedMesh
 
 __all__ = ["Choice", "Weights", "choose_weights", "load_weights"]
 
@@ -18,11 +18,10 @@ Weights = str | os.PathLike[str] | PretrainedTransfer
 
 
 class Choice(NamedTuple):
-    """The network, which it is and why, and what may be wrong with the choice."""
+    """The network, which it is and why."""
 
     net: PretrainedTransfer
     why: str
-    doubts: tuple[str, ...] = ()
 
 
 def choose_weights(
@@ -49,18 +48,15 @@ def choose_weights(
         return Choice(net, net.card.get("name", "the given network"))
     if weights != "auto":
         return Choice(load_weights(weights, device or "cpu"), os.fspath(weights))
-    kind, clear = identity().likeness
-    fitting = [net for net in map(load_pretrained, pretrained_names()) if net.card["data"] == kind]
+    like = identity().likeness
+    fitting = [net for net in map(load_pretrained, pretrained_names()) if net.card["data"] == like.kind]
     if not fitting:
-        raise ValueError(f"no weights for {kind} come with this installation: name some, or the folder of a run")
+        raise ValueError(f"no weights for {like.kind} come with this installation: name some, or the folder of a run")
     best = min(fitting, key=lambda net: net.card["figures"]["pmd"])
-    why = f"{best.card['name']}, as the identity's shape is {'' if clear else 'more or less '}that of {kind}"
-    doubts = (
-        ()
-        if clear
-        else (f"the identity's shape is between humans' and animals': {kind} were assumed; name the weights",)
-    )
-    return Choice(best.to(device or "cpu"), why, doubts)
+    reason = f"as the identity's shape is that of {like.kind}"
+    if not like.clear:
+        reason = f"those for {like.kind}, as the identity's shape is {'of neither kind' if like.neither else 'unclear'}"
+    return Choice(best.to(device or "cpu"), f"{best.card['name']}, {reason}")
 
 
 def _check_device(device: torch.device | str) -> None:

@@ -1,65 +1,22 @@
-"""A mesh of unknown origin made ready for the weights, and the way back."""
+"""An opened mesh made ready for the weights, and the way back."""
 
 import dataclasses
-import os
-import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TypeVar
 
 from torch import Tensor
 
-from meshkit.io import CleanMesh, MeshFileError, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
+from meshkit.io import CleanMesh, MeshReport, SimpleMesh
 from meshkit.io.report import counted
 from meshkit.models import PretrainedTransfer
-from meshkit.transfer._frames import DOUBT, UNITS, Scale, axis_name, find_rotation, find_scale, rotations
-from meshkit.transfer._kinds import guess_kind, rest_body, surface_area
+from meshkit.transfer._frames import axis_name, rotations
+from meshkit.transfer._kinds import Likeness, rest_body, surface_area
+from meshkit.transfer._open import OpenedMesh, named
+from meshkit.transfer._orient import RestBody, agrees, find_rotation
+from meshkit.transfer._units import UNITS, Scale, find_scale, scale_to
 
-__all__ = ["Mesh", "OpenedMesh", "Prepared", "axes_doubt", "examine", "named", "open_mesh", "prepare", "read"]
+__all__ = ["Prepared", "axes_doubt", "prepare"]
 
-T = TypeVar("T")
-Mesh = str | os.PathLike[str] | tuple[Tensor, Tensor]
-"""A mesh file, or vertices (V, 3) and faces (F, 3)."""
-
-_FEWEST = 64  # the signatures rest on 64 eigenpairs
-_LOOKED_AT = 1000  # vertices that tell people from animals
-
-
-@dataclass(frozen=True)
-class OpenedMesh:
-    """One mesh as it came, and its clean surface: what does not depend on the weights.
-
-    Attributes:
-        name: of the file, or what the mesh is for.
-        faces: (F, 3) as they came.
-        report: on the mesh as it came.
-        clean: the one clean surface of it, in the file's axes and unit.
-        notes: what was done or should be known.
-    """
-
-    name: str
-    faces: Tensor
-    report: MeshReport
-    clean: CleanMesh
-    notes: tuple[str, ...]
-
-    def simplified(self, num_verts: int) -> SimpleMesh:
-        """The clean surface with ``num_verts`` vertices, as far as it has more."""
-        return self._looked_at if num_verts == _LOOKED_AT else self._simplify(num_verts)
-
-    @cached_property
-    def likeness(self) -> tuple[str, bool]:
-        """What :func:`guess_kind` says of it."""
-        small = self._looked_at
-        return named(self.name, lambda: guess_kind(small.verts, small.faces))
-
-    @cached_property
-    def _looked_at(self) -> SimpleMesh:
-        return self._simplify(_LOOKED_AT)
-
-    def _simplify(self, num_verts: int) -> SimpleMesh:
-        return named(self.name, lambda: simplify(self.clean.verts, self.clean.faces, num_verts))
+_GIVEN = "given"
 
 
 @dataclass(frozen=True)
@@ -67,33 +24,38 @@ class Prepared:
     """One mesh on its way to the weights.
 
     Attributes:
-        name: of the file, or what the mesh is for.
-        faces: (F, 3) as they came.
-        report: on the mesh as it came.
+        opened: the mesh as it came.
         clean: the one clean surface of it, scaled.
         simple: that with fewer vertices.
         descriptors: (N, D) what the weights take of the simple mesh; ``None`` if they take none.
         scale: how its lengths became metres.
         rotation: (3, 3) takes the file's axes to those of the weights.
         found: how ``rotation`` came about.
-        likeness: ``"humans"`` or ``"animals"``, whichever it is more like, and whether that is clear; ``None`` if the
-            weights do not say what they are for.
+        likeness: the kind of body that it is like; ``None`` if the weights do not say what they are for.
         doubts: what may be wrong with it, in words.
         notes: what was done or should be known.
     """
 
-    name: str
-    faces: Tensor
-    report: MeshReport
+    opened: OpenedMesh
     clean: CleanMesh
     simple: SimpleMesh
     descriptors: Tensor | None
     scale: Scale
     rotation: Tensor
     found: str
-    likeness: tuple[str, bool] | None
+    likeness: Likeness | None
     doubts: tuple[str, ...]
     notes: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Of the file, or what the mesh is for."""
+        return self.opened.name
+
+    @property
+    def faces(self) -> Tensor:
+        """(F, 3) as they came."""
+        return self.opened.faces
 
     @property
     def verts(self) -> Tensor:
@@ -111,53 +73,11 @@ class Prepared:
 
     def __str__(self) -> str:
         facing = axis_name(-self.rotation[1])
-        lines = [f"{line}" for line in str(self.report).splitlines() if not line.startswith("frame")]
+        lines = [line for line in str(self.opened.report).splitlines() if not line.startswith("frame")]
+        # The report guesses unit and frame from the extent alone; what was taken follows.
+        lines = [line.partition(", if this")[0].partition(", the size of")[0] for line in lines]
         lines.append(f"frame    up {axis_name(self.up)}, facing {facing} ({self.found}); unit {self.scale}")
         return "\n".join(lines + [f"done     {note}" for note in self.notes])
-
-
-def read(mesh: Mesh, role: str) -> tuple[str, Tensor, Tensor, tuple[str, ...]]:
-    """Name, vertices and faces of a mesh, and what the reader warned about.
-
-    Raises:
-        MeshFileError: the file is missing, damaged or no mesh.
-        ValueError: something else than a path or two tensors.
-    """
-    if isinstance(mesh, str | os.PathLike):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            verts, faces = load_mesh(mesh)
-        return os.fspath(mesh), verts, faces, tuple(str(w.message) for w in caught)
-    if not (isinstance(mesh, tuple) and len(mesh) == 2 and all(isinstance(part, Tensor) for part in mesh)):
-        raise ValueError(f"{role} must be a path or a tuple (verts, faces) of tensors, got {type(mesh).__name__}")
-    return role, mesh[0].detach(), mesh[1], ()
-
-
-def open_mesh(mesh: Mesh, role: str) -> OpenedMesh:
-    """Read a mesh, report on it and clean it.
-
-    Args:
-        mesh: file or tensors.
-        role: what it is for, for messages.
-
-    Raises:
-        MeshFileError: the file is missing, damaged or no mesh.
-        ValueError: the mesh cannot be used; the message says why.
-    """
-    return examine(*read(mesh, role))
-
-
-def examine(name: str, verts: Tensor, faces: Tensor, notes: tuple[str, ...]) -> OpenedMesh:
-    """As :func:`open_mesh`, of a mesh that was read."""
-    report = named(name, lambda: mesh_report(verts, faces))
-    clean = named(name, lambda: clean_mesh(verts, faces))
-    if len(clean.verts) < _FEWEST:
-        raise ValueError(
-            f"{name}: {len(clean.verts)} vertices in its largest part; a body needs {_FEWEST} or more to be recognised"
-        )
-    if clean.changes:
-        notes += (f"cleaned: {clean}",)
-    return OpenedMesh(name, faces, report, clean, notes)
 
 
 def prepare(
@@ -169,6 +89,7 @@ def prepare(
     unit: str | None = None,
     up: str | None = None,
     facing: str | None = None,
+    rest: RestBody | None = None,
 ) -> Prepared:
     """Scale, simplify and orient a mesh.
 
@@ -181,17 +102,15 @@ def prepare(
         unit: of the file; guessed if ``None``.
         up: signed axis to the body's head (or back, for an animal); found if ``None``.
         facing: signed axis that the body looks along; found if ``None``.
+        rest: ``RestBody(net, kind)``, if it is at hand.
 
     Raises:
         ValueError: the mesh cannot be used; the message says why.
     """
     name, report, clean, notes = opened.name, opened.report, opened.clean, opened.notes
     net_device = next(net.parameters()).device
-    among = ("m", "cm", "mm") if kind == "animals" else tuple(UNITS)
-    area = float(surface_area(clean.verts, clean.faces))
-    usual_area = float(surface_area(*rest_body(kind or "humans")))
-    scale = named(name, lambda: find_scale(area, usual_area, unit, among=among))
-    scale = dataclasses.replace(scale, metric=kind != "animals")
+    likeness = None if kind is None else opened.likeness  # it costs a spectrum
+    scale = named(name, lambda: _scale(opened, kind, likeness, unit))
 
     def scaled(verts: Tensor) -> Tensor:
         return (verts * scale.factor).float().to(net_device)
@@ -214,20 +133,29 @@ def prepare(
     if report.boundary_edges:
         notes += (f"the surface is open ({counted(report.boundary_loops, 'hole')}), which the weights have not seen",)
     descriptors = named(name, lambda: net.describe(simple.verts, simple.faces))
-    rotation, found, clear = named(name, lambda: _rotation(report, simple, descriptors, net, kind, up, facing))
+    rest = rest or (None if kind is None else RestBody(net, kind))
+    rotation, found, clear = named(name, lambda: _rotation(report, simple, descriptors, rest, up, facing))
     doubts: tuple[str, ...] = (f"{name}: {scale.doubt}",) if scale.doubt else ()
     if not clear:
-        doubts += (axes_doubt(name, rotation),)
-    likeness = None if kind is None else opened.likeness  # it costs a spectrum
+        doubts += (axes_doubt(name, rotation, given=found == _GIVEN),)
     rotation = rotation.to(metric.verts)
-    return Prepared(
-        name, opened.faces, report, metric, simple, descriptors, scale, rotation, found, likeness, doubts, notes
-    )
+    return Prepared(opened, metric, simple, descriptors, scale, rotation, found, likeness, doubts, notes)
 
 
-def axes_doubt(name: str, rotation: Tensor) -> str:
+def _scale(opened: OpenedMesh, kind: str | None, likeness: Likeness | None, unit: str | None) -> Scale:
+    area = float(surface_area(opened.clean.verts, opened.clean.faces))
+    usual_area = float(surface_area(*rest_body(kind or "humans")))
+    if unit is None and likeness is not None and not (likeness.clear and likeness.kind == kind):
+        return scale_to(area, usual_area)  # the size says nothing about the unit
+    among = ("m", "cm", "mm") if kind == "animals" else tuple(UNITS)
+    return dataclasses.replace(find_scale(area, usual_area, unit, among=among), metric=kind != "animals")
+
+
+def axes_doubt(name: str, rotation: Tensor, *, given: bool = False) -> str:
     """What is said of axes that are not clear."""
     axes = f"up {axis_name(rotation[2])}, facing {axis_name(-rotation[1])}"
+    if given:
+        return f"{name}: the axes given ({axes}) seem wrong: leave them out to have them found"
     return f"{name}: axes in doubt ({axes}): give them if they are wrong"
 
 
@@ -235,37 +163,21 @@ def _rotation(
     report: MeshReport,
     simple: SimpleMesh,
     descriptors: Tensor | None,
-    net: PretrainedTransfer,
-    kind: str | None,
+    rest: RestBody | None,
     up: str | None,
     facing: str | None,
 ) -> tuple[Tensor, str, bool]:
     """The rotation, how it came about, and whether it is clear."""
     if up is not None and facing is not None:
-        return rotations(up, facing)[0], "given", True
-    if kind is None:
+        rotation = rotations(up, facing)[0]
+        clear = rest is None or agrees(rest, simple.verts, simple.faces, descriptors=descriptors, rotation=rotation)
+        return rotation, _GIVEN, clear
+    if rest is None:
         up, facing = up or report.up, facing or report.facing
         if up is None or facing is None:
             raise ValueError("up and facing are not clear, and these weights do not say what they know: give both")
         return rotations(up, facing)[0], "guessed from symmetry and feet", True
-    rotation, lead = find_rotation(
-        net,
-        simple.verts,
-        simple.faces,
-        descriptors=descriptors,
-        reference=rest_body(kind),
-        candidates=rotations(up, facing),
-    )
+    candidates = rotations(up, facing)
+    rotation, clear = find_rotation(rest, simple.verts, simple.faces, descriptors=descriptors, candidates=candidates)
     found = "found by matching to a rest body" if up is None and facing is None else "partly given"
-    clear = lead > DOUBT
     return rotation, found if clear else f"{found}, in doubt", clear
-
-
-def named(name: str, make: Callable[[], T]) -> T:
-    """Run ``make`` and put the mesh's name before what it complains about."""
-    try:
-        return make()
-    except ValueError as error:
-        # Other kinds of ValueError, such as UnicodeDecodeError, cannot be made from a text.
-        kind = MeshFileError if isinstance(error, MeshFileError) else ValueError
-        raise kind(f"{name}: {error}") from error

@@ -12,7 +12,7 @@ import numpy as np
 
 from meshkit.io import MeshFileError, atomic_write, save_mesh
 from meshkit.models import pretrained_names
-from meshkit.transfer._frames import UNITS
+from meshkit.transfer._units import UNITS
 from meshkit.transfer.output import save_page, save_picture
 from meshkit.transfer.report import TransferResult
 from meshkit.transfer.sequence import is_sequence, transfer_sequence
@@ -100,7 +100,10 @@ def _fail(message: str) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Transfer, write and report."""
+    """Transfer, write and report. What costs nothing to find wrong is found first."""
+    for path in (args.identity, args.pose):
+        if not path.exists():
+            raise MeshFileError(f"{path}: no such file")
     many = is_sequence(args.pose)
     suffix = args.out.suffix.lower()
     if suffix not in (*_FORMATS, *((".npz",) if many else ())):
@@ -117,7 +120,7 @@ def run(args: argparse.Namespace) -> None:
     else:
         result = transfer_pose(args.identity, args.pose, **options)
         save_mesh(args.out, result.verts, result.faces)
-        _tell(result, args, args.out, whole=True)
+        _tell(result, args, args.out, whole=True, said=set())
         shown = [result]
     if not args.no_picture:
         save_picture(args.out.with_suffix(".png"), shown)
@@ -139,14 +142,14 @@ def _write_sequence(results: Iterator[TransferResult], args: argparse.Namespace)
     """Write every pose as it comes; the results that the picture shows."""
     as_archive = args.out.suffix.lower() == ".npz"
     frames, kept = [], []
-    step = 1
+    step, said = 1, set[str]()
     for number, result in enumerate(results):
         file = args.out.with_name(f"{args.out.stem}_{number:04d}{args.out.suffix}")
         if as_archive:
             frames.append(result.verts.numpy())
         else:
             save_mesh(file, result.verts, result.faces)
-        _tell(result, args, None if as_archive else file, whole=number == 0)
+        _tell(result, args, None if as_archive else file, whole=number == 0, said=said)
         if number % step == 0:
             kept.append(result)
         if len(kept) > _ROWS:  # evenly spaced ones, however many there will be
@@ -159,15 +162,18 @@ def _write_sequence(results: Iterator[TransferResult], args: argparse.Namespace)
     return kept
 
 
-def _tell(result: TransferResult, args: argparse.Namespace, file: Path | None, *, whole: bool) -> None:
+def _tell(result: TransferResult, args: argparse.Namespace, file: Path | None, *, whole: bool, said: set[str]) -> None:
+    """Print the report, or of a later pose what was not ``said`` of an earlier one."""
     report = result.report
+    news = [warning for warning in report.warnings if warning not in said]
+    said.update(news)
     if args.quiet:
-        for warning in report.warnings:
+        for warning in news:
             print(f"unusual: {report.pose.name}: {warning}", file=sys.stderr)
         return
     if whole:
         print(report)
-    elif report.warnings:
-        print(f"{report.pose.name}: unusual: {'; '.join(report.warnings)}")
+    elif news:
+        print(f"{report.pose.name}: unusual: {'; '.join(news)}")
     if file is not None:
         print(f"{file}: {len(result.verts)} vertices")

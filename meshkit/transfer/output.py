@@ -1,6 +1,7 @@
 """Pictures and pages of transfers."""
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from torch import Tensor
 from meshkit.batching import center
 from meshkit.io import atomic_write
 from meshkit.io.report import counted
-from meshkit.transfer.report import TransferResult
+from meshkit.transfer.report import TransferReport, TransferResult
 from meshkit.viz import contact_sheet, render, save_html
 
 __all__ = ["save_page", "save_picture"]
@@ -54,8 +55,21 @@ def save_page(path: str | os.PathLike[str], result: TransferResult) -> None:
     """
     report = result.report
     meshes = dict(zip(_TITLES, _upright(result), strict=True))
-    notes = [Path(report.identity.name).name, Path(report.pose.name).name, "; ".join(report.warnings) or report.weights]
+    headlines = "; ".join(_headline(warning, report) for warning in report.warnings)
+    notes = [Path(report.identity.name).name, Path(report.pose.name).name, headlines or report.weights]
     save_html(path, meshes, title="Pose transfer", notes=notes)
+
+
+def _headline(warning: str, report: TransferReport) -> str:
+    """What a warning says, without the numbers and the advice, which the report has room for."""
+    for role, mesh in (("identity", report.identity), ("pose", report.pose)):
+        if warning.startswith(f"{mesh.name}: "):
+            return f"{role}: {_first_clause(warning.removeprefix(f'{mesh.name}: '))}"
+    return _first_clause(warning)
+
+
+def _first_clause(text: str) -> str:
+    return re.split(r" \(|[:;]", text, maxsplit=1)[0]
 
 
 def _upright(result: TransferResult) -> list[tuple[Tensor, Tensor]]:

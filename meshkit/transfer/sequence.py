@@ -15,9 +15,10 @@ from torch import Tensor
 from meshkit.io import MeshFileError, SurfaceBinding
 from meshkit.io._binary_readers import read_scene
 from meshkit.transfer._choose import Weights
-from meshkit.transfer._frames import DOUBT, find_rotation, turns_about
-from meshkit.transfer._kinds import rest_body
-from meshkit.transfer._prepare import Mesh, Prepared, axes_doubt, examine, named, read
+from meshkit.transfer._frames import turns_about
+from meshkit.transfer._open import Mesh, examine, named, read
+from meshkit.transfer._orient import find_rotation
+from meshkit.transfer._prepare import Prepared, axes_doubt
 from meshkit.transfer.report import TransferResult
 from meshkit.transfer.transfer import PoseTransfer
 
@@ -213,21 +214,22 @@ class _Follower:
         small = clean.verts if first.simple.method == "none" else self._binding.carry(clean.verts)
         simple = replace(first.simple, verts=small, original=clean.verts)
         descriptors = named(name, lambda: transfer.net.describe(small, simple.faces))
-        rotation, doubts = before.rotation, first.doubts
-        if self._turns and transfer.kind is not None and hasattr(transfer.net.generator, "match"):
-            rotation, lead = named(
+        rotation, doubts, rest = before.rotation, first.doubts, transfer.rest
+        if self._turns and rest is not None and hasattr(transfer.net.generator, "match"):
+            # What was in doubt about the first one's axes is asked anew.
+            doubts = tuple(doubt for doubt in doubts if doubt != axes_doubt(first.name, first.rotation))
+            rotation, clear = named(
                 name,
                 lambda: find_rotation(
-                    transfer.net,
+                    rest,
                     small,
                     simple.faces,
                     descriptors=descriptors,
-                    reference=rest_body(transfer.kind or ""),
                     candidates=turns_about(before.rotation),
                     usual=before.rotation[None],
                 ),
             )
-            if lead <= DOUBT:
+            if not clear:
                 doubts += (axes_doubt(name, rotation),)
-        current = replace(first, name=name, clean=clean, simple=simple, descriptors=descriptors, doubts=doubts)
-        return replace(current, rotation=rotation.to(small))
+        current = replace(first, opened=replace(first.opened, name=name), clean=clean, simple=simple)
+        return replace(current, descriptors=descriptors, doubts=doubts, rotation=rotation.to(small))

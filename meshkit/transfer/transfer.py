@@ -11,7 +11,9 @@ from meshkit.deform import arap_deform
 from meshkit.models import GeneratorOutput, PretrainedTransfer
 from meshkit.transfer._choose import Weights, choose_weights
 from meshkit.transfer._frames import axis_name, turn_up
-from meshkit.transfer._prepare import Mesh, OpenedMesh, Prepared, named, open_mesh, prepare
+from meshkit.transfer._open import Mesh, OpenedMesh, named, open_mesh
+from meshkit.transfer._orient import RestBody
+from meshkit.transfer._prepare import Prepared, prepare
 from meshkit.transfer.confidence import Confidence, measure_confidence
 from meshkit.transfer.report import TransferReport, TransferResult
 
@@ -76,14 +78,16 @@ class PoseTransfer:
         self.frame = frame
         self.refine = REFINE if refine is True else None if refine is False else float(refine)
         opened = cache(lambda: open_mesh(identity, "identity"))
-        self.net, self.weights, self._doubts = choose_weights(weights, opened, device=device)
+        self.net, self.weights = choose_weights(weights, opened, device=device)
         self.kind: str | None = self.net.card.get("data")
+        self.rest = None if self.kind is None else RestBody(self.net, self.kind)
         self.identity = self.prepare(opened(), unit=identity_unit, up=identity_up, facing=identity_facing)
 
     def prepare(self, opened: OpenedMesh, *, unit: str | None, up: str | None, facing: str | None) -> Prepared:
         """Make a mesh ready for the weights: an identity mesh, or a pose mesh for :meth:`apply`."""
         num_verts = self.net.card.get("vertices") or _VERTICES.get(self.kind or "", 1000)
-        return prepare(opened, net=self.net, kind=self.kind, num_verts=num_verts, unit=unit, up=up, facing=facing)
+        options = {"unit": unit, "up": up, "facing": facing}
+        return prepare(opened, net=self.net, kind=self.kind, num_verts=num_verts, rest=self.rest, **options)
 
     @torch.no_grad()
     def __call__(
@@ -117,7 +121,7 @@ class PoseTransfer:
             small = _refined(own.verts, own.simple.faces, small, self.refine)
         posed = own.carry(small)
         usual = net.card.get("usual", {})
-        doubts = (*self._doubts, *self._strangers(other), *own.doubts, *other.doubts)
+        doubts = (*self._strangers(other), *own.doubts, *other.doubts)
         report = TransferReport(
             own,
             other,
@@ -139,12 +143,15 @@ class PoseTransfer:
         return TransferResult(self._placed(posed, other, other.up if up is None else up).cpu(), faces, report, views)
 
     def _strangers(self, other: Prepared) -> tuple[str, ...]:
-        """Which of the two meshes are clearly of another kind than the weights."""
+        """Which of the two meshes are not of the weights' kind."""
         found = []
         for role, mesh in (("identity", self.identity), ("pose", other)):
-            kind, clear = mesh.likeness or (self.kind, False)
-            if clear and kind != self.kind:
-                found.append(f"these weights are for {self.kind}, but the {role} mesh has the shape of {kind}")
+            like = mesh.likeness
+            if like is not None and not like.clear:
+                found.append(f"the {role} mesh has {like.doubt}")
+            elif like is not None and like.kind != self.kind:
+                shape = f"the {role} mesh has the shape of {like.kind}"
+                found.append(f"these weights are for {self.kind}, but {shape}: use weights of its kind")
         return tuple(found)
 
     def _frame_in_words(self, other: Prepared, up: Tensor) -> str:

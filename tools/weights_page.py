@@ -1,0 +1,107 @@
+"""The page of shipped weights, meshkit/weights/NAME.md, from the facts in their card, NAME.json."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from meshkit.io import atomic_write
+
+UNITS = {
+    "humans": ("metres", "m"),
+    "animals": (
+        "the unit of the shipped animals, which is arbitrary (a rest bounding box has a diagonal of 1.5 to 2.1)",
+        "units",
+    ),
+}
+LENGTHS = {  # keys of the card that are lengths: only humans are in metres
+    "humans": ("correspondence_m", "largest_distance_m"),
+    "animals": ("correspondence_units", "largest_distance_units"),
+}
+GIVEN = {  # the meshes that the usual numbers are measured on
+    "humans": "given at 1000, 2000, 3445 and 6890 vertices",
+    "animals": "given as they are shipped, and with each face cut into four",
+}
+
+
+def write_card(folder: Path, card: dict[str, Any]) -> None:
+    """Write the card of weights and its page."""
+    name = card["name"]
+    for suffix, text in ((".json", json.dumps(card, indent=2) + "\n"), (".md", markdown(name, card))):
+        with atomic_write(folder / f"{name}{suffix}") as path:
+            path.write_text(text, encoding="utf-8")
+
+
+def network(card: dict[str, Any]) -> str:
+    """What the name of the system does not say of its network, as a line of the card."""
+    if card["system"].startswith("3D-CoreNet") and card["model"]["extractor"] == "setconv":
+        return (
+            "- **Network**: with X-DualNet's extractor of set convolutions, as the recipe's; the published one, that\n"
+            "  of `meshkit.models.corenet3d()`, is pointwise.\n"
+        )
+    return ""
+
+
+def markdown(name: str, card: dict[str, Any]) -> str:
+    figures = card["figures"]
+    rows = "\n".join(f"| {key} | {value} |" for key, value in figures.items())
+    machine = card["machine"]
+    processor = machine["gpu"] or machine["processor"]
+    minutes = card["train_minutes"]
+    unit, short = UNITS[card["data"]]
+    moved = card["rounding"][LENGTHS[card["data"]][1]]
+    distance = f"{1e3 * moved:.3f} mm" if short == "m" else f"{moved:.1e} {short}"
+    return f"""# {name}
+
+{card["system"]}, preset `{card["preset"]}`, trained on the {card["data"]} that ship with meshkit.
+
+```python
+import torch
+from meshkit.models import load_pretrained
+
+net = load_pretrained("{name}")
+posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces)  # (V, 3)
+```
+
+- **Input**: two meshes, z up, facing -y, around {card["vertices"]} vertices each, in {unit};
+  `meshkit.transfer` brings others there.
+{network(card)}- **Training**: `{card["command"]}`
+  ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor}, {card["precision"]}, torch
+  {machine["torch"]}), finished on {card["date"]}.
+- **Split**: {card["split"]}
+- **Size**: {card["parameters"]:,} parameters, those of the residual blocks stored with 16 bits. Rounding them moves no
+  vertex of {card["rounding"]["pairs"]} test pairs by more than {distance}.
+- **Licence**: {card["licence"]["id"]}. {card["licence"]["note"]}
+
+## Figures
+
+Means over the first {card["test_pairs"]} fixed test pairs, by the network as it was trained, not rounded.
+Units: {card["units"]}. `copy_identity` and `copy_warped` are what the unchanged
+identity and the warped mesh would score.
+
+| figure | value |
+|---|---:|
+{rows}
+
+{usual_section(card)}
+## Limits
+
+Bodies, poses and animals unlike the training set; several people in one mesh; clothes and hair that are not one surface
+with the body; limbs that touch. Left and right limbs that look alike are sometimes exchanged.
+"""
+
+
+def usual_section(card: dict[str, Any]) -> str:
+    """The section of a card's page that says what is usual."""
+    rows = "\n".join(f"| {key} | {v['median']} | {v['limit']} |" for key, v in card["usual"].items())
+    return f"""## What is usual
+
+Over {card["usual_pairs"]} pairs of unseen bodies in unseen poses, {GIVEN[card["data"]]},
+mixed, and made ready by `meshkit.transfer` (`tools/measure_usual.py`). A transfer is called unusual when a number lies
+beyond the limit (99 of 100 of these pairs lie within); `meshkit.transfer.Confidence` says what the numbers are.
+
+| number | median | limit |
+|---|---:|---:|
+{rows}
+"""
