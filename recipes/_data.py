@@ -28,6 +28,7 @@ from meshkit.data import (
     load_smal,
     load_smpl,
     sample_identities,
+    sample_poses,
     scan_faust,
     scan_mgn,
     scan_pose_transfer,
@@ -56,14 +57,17 @@ def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -
         raise UserError(f"--data {cfg.data}: there is no {place}")
     try:
         if kind in SCANNERS:
-            if cfg.sampled_identities:
-                raise UserError("--sampled-identities needs a rig, whose shapes have coefficients: drop it")
+            if cfg.sampled_identities or cfg.sampled_poses:
+                flag = "identities" if cfg.sampled_identities else "poses"
+                raise UserError(f"--sampled-{flag} needs a rig, whose {flag} have coefficients: drop it")
             return files(cfg, run, SCANNERS[kind](place))
         body, split = rigged(kind, Path(place)) if place else load_shipped(kind, cfg.vertices)
     except ValueError as error:
         raise UserError(f"--data {cfg.data}: {error}") from None
     if cfg.sampled_identities:
         body, split = with_sampled_identities(body, split, cfg.sampled_identities, cfg.seed)
+    if cfg.sampled_poses:
+        body, split = with_sampled_poses(body, split, cfg.sampled_poses, cfg.seed)
     train, test = posed(cfg, run, workers, body, split)
     return train.to(device), test.to(device)
 
@@ -123,6 +127,18 @@ def with_sampled_identities(body: RiggedModel, split: Split, count: int, seed: i
     body.identity_names = ()
     train = torch.cat([split.train_identities, len(known) + torch.arange(count)])
     return body, replace(split, train_identities=train)
+
+
+def with_sampled_poses(body: RiggedModel, split: Split, count: int, seed: int) -> tuple[RiggedModel, Split]:
+    """A body and split with ``count`` more training poses, put together from the known training ones."""
+    if body.poses is None:
+        raise UserError("this rig has no poses to put others together from")
+    draw = torch.Generator().manual_seed(seed)
+    known = body.poses
+    new = sample_poses(known[split.train_poses], body.parents, count, generator=draw)
+    body.poses = torch.cat([known, new])
+    body.pose_names = ()
+    return body, replace(split, train_poses=torch.cat([split.train_poses, len(known) + torch.arange(count)]))
 
 
 def drawn_split(identities: int, poses: int, draw: torch.Generator) -> Split:
@@ -237,8 +253,10 @@ def posed(cfg: Any, run: Run, workers: int, body: RiggedModel, split: Split) -> 
         }
         for side in pools:
             key = f"{side}, {cfg.data}, {len(body.template)} vertices, {cfg.model.num_signatures} signatures, "
-            if side == "train" and cfg.sampled_identities:
-                key += f"{cfg.sampled_identities} sampled identities, "
+            if side == "train":
+                for what in ("identities", "poses"):
+                    count = getattr(cfg, f"sampled_{what}")
+                    key += f"{count} sampled {what}, " if count else ""
             key += f"pool {cfg.pool}, seed {cfg.seed}" if side == "train" else f"{len(listed)} pairs"
             stored = run.load_tensors(f"pool_{side}.safetensors", key)
             if stored is None:

@@ -61,6 +61,8 @@ class Settings:
     sampled_identities: int = 0
     """Further training identities, drawn from the Gaussian of the known ones; shipped and licensed rigs alone. Paper:
     SMAL's animals are drawn so."""
+    sampled_poses: int = 0
+    """Further training poses: the trunk of one of the known ones, each limb of another; rigs alone. Paper: none."""
     pool: int = 1200
     """Training meshes whose signatures are computed beforehand (with --model.descriptors wks)."""
     workers: int = 0

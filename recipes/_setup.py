@@ -35,8 +35,10 @@ def check(cfg: Any) -> None:
         value = getattr(cfg, name, None)
         if value is not None and value < 1:
             raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
-    if getattr(cfg, "sampled_identities", 0) < 0:
-        raise UserError(f"--sampled-identities must not be negative, got {cfg.sampled_identities}")
+    for what in ("identities", "poses"):
+        count = getattr(cfg, f"sampled_{what}", 0)
+        if count < 0:
+            raise UserError(f"--sampled-{what} must not be negative, got {count}")
     if cfg.steps is None and (cfg.minutes is None or cfg.minutes <= 0):
         raise UserError(f"give --steps, or positive --minutes, got {cfg.minutes}")
     together, processes = cfg.batch * cfg.accumulate * world_size(cfg.devices), world_size(cfg.devices)

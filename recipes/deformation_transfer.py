@@ -99,6 +99,7 @@ def main() -> None:
         ground_truth=True,
         pool=0,
         sampled_identities=0,
+        sampled_poses=0,
     )
     _, pairs = data(settings, run, workers=1)
     assert isinstance(pairs, PosePairs)

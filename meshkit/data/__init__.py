@@ -24,7 +24,8 @@ from meshkit.data.licensed import SMAL_FAMILIES, load_smal, load_smpl
 from meshkit.data.mesh_pairs import MeshPairs
 from meshkit.data.pairs import PosePairs
 from meshkit.data.pool import MeshPool
-from meshkit.data.rigged import RiggedModel, rotation_matrices, sample_identities
+from meshkit.data.rigged import RiggedModel, rotation_matrices
+from meshkit.data.sampling import sample_identities, sample_poses
 from meshkit.data.sampler import PairSampler, pair_loader
 from meshkit.data.store import MeshStore
 
@@ -54,6 +55,7 @@ __all__ = [
     "read_test_list",
     "rotation_matrices",
     "sample_identities",
+    "sample_poses",
     "scan_faust",
     "scan_mgn",
     "scan_pose_transfer",

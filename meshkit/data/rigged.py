@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-__all__ = ["RiggedModel", "rotation_matrices", "sample_identities"]
+__all__ = ["RiggedModel", "rotation_matrices"]
 
 
 def rotation_matrices(rotation_vectors: Tensor) -> Tensor:
@@ -221,45 +221,6 @@ class RiggedModel(nn.Module):
             f"pose must be (B,) integers, (B, {self.num_joints}, 3) rotation vectors or (B, {self.num_joints}, 3, 3) "
             f"matrices, got {tuple(pose.shape)}"
         )
-
-
-def sample_identities(
-    identities: Tensor, count: int, *, spread: float = 1.0, generator: torch.Generator | None = None
-) -> Tensor:
-    r"""New identities like those of a table: drawn from the Gaussian that has their mean and covariance.
-
-    .. math:: \beta = \bar\beta + \frac{s}{\sqrt{I - 1}} \sum_{i=1}^{I} z_i \, (\beta_i - \bar\beta),
-              \qquad z_i \sim N(0, 1)
-
-    So bodies are drawn for SMAL, whose shapes beyond the scanned toys are all of this kind. Rows whose coefficients are
-    shares of given bodies, as those of the shipped animals, give rows that sum to one as well, some shares of which are
-    negative.
-
-    Args:
-        identities: ``(I, K)`` shape coefficients, at least two rows.
-        count: how many.
-        spread: factor s on the standard deviations. At 1 a few animals in a hundred turn inside out somewhere.
-        generator: of the numbers z, which are drawn on its device; on the CPU if ``None``.
-
-    Returns:
-        ``(count, K)``.
-
-    Raises:
-        ValueError: fewer than two rows.
-
-    Example:
-        >>> from meshkit.data import load_shipped
-        >>> animals, split = load_shipped("animals")
-        >>> new = sample_identities(animals.identities[split.train_identities], 5, spread=0.7)
-        >>> animals(new, split.train_poses[:5]).shape
-        torch.Size([5, 1962, 3])
-    """
-    if identities.dim() != 2 or len(identities) < 2:
-        raise ValueError(f"a table of at least two rows (I, K) is needed, got {tuple(identities.shape)}")
-    mean = identities.mean(0)
-    device = "cpu" if generator is None else generator.device
-    z = torch.randn(count, len(identities), generator=generator, device=device, dtype=identities.dtype).to(identities)
-    return mean + spread * (z @ (identities - mean)) / (len(identities) - 1) ** 0.5
 
 
 def _rows(table: Tensor | None, index: Tensor, what: str) -> Tensor:
