@@ -25,8 +25,8 @@ from meshkit.data.mesh_pairs import MeshPairs
 from meshkit.data.pairs import PosePairs
 from meshkit.data.pool import MeshPool
 from meshkit.data.rigged import RiggedModel, rotation_matrices
-from meshkit.data.sampling import sample_identities, sample_poses
 from meshkit.data.sampler import PairSampler, pair_loader
+from meshkit.data.sampling import sample_identities, sample_poses
 from meshkit.data.store import MeshStore
 
 __all__ = [
