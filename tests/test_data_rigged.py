@@ -14,6 +14,7 @@ from meshkit.data import (
     load_humans,
     rotation_matrices,
     sample_identities,
+    sample_poses,
 )
 
 
@@ -209,6 +210,41 @@ def test_sampled_shares_sum_to_one_and_stay_in_the_span_of_the_table():
     drawn = sample_identities(shares, 20)
     assert torch.allclose(drawn.sum(1), torch.ones(20), atol=1e-5)
     assert bool((drawn[:, 4:] == 0).all())  # other bodies stay unseen
+
+
+# Joint 0 is the root, 1 to 3 the spine, 4 a leg with its foot 5, 6 and 7 arms (with two fingers the second), 10 a head.
+BRANCHED = torch.tensor([-1, 0, 1, 2, 0, 4, 3, 3, 7, 7, 3])
+
+
+def test_sampled_poses_have_the_trunk_of_one_and_each_limb_of_one():
+    """All joints of a part come from one pose; parts come from each pose equally often, and independently."""
+    parts = [[0, 1, 2, 3], [4, 5], [6], [7, 8, 9], [10]]
+    table = torch.arange(3.0)[:, None, None, None].expand(3, 11, 3, 3)
+    for poses in (table, table[..., 0]):
+        donors = sample_poses(poses, BRANCHED, 9000, generator=torch.Generator().manual_seed(1)).flatten(2)
+        assert bool((donors == donors[..., :1]).all())
+        donors = donors[..., 0]
+        for part in parts:
+            assert bool((donors[:, part] == donors[:, part[:1]]).all())
+        of_part = donors[:, [part[0] for part in parts]]
+        for i, a in enumerate(of_part.T):
+            for b in of_part.T[:i]:
+                counts = (3 * a + b).long().bincount(minlength=9)
+                assert bool(((counts - 1000).abs() < 130).all())  # over four standard deviations
+
+
+def test_sampled_poses_are_repeated_by_the_generator():
+    poses = torch.randn(5, 11, 3)
+    first, again = (sample_poses(poses, BRANCHED, 4, generator=torch.Generator().manual_seed(2)) for _ in range(2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, sample_poses(poses, BRANCHED, 4, generator=torch.Generator().manual_seed(3)))
+
+
+def test_sampled_poses_need_poses_of_the_joints():
+    with pytest.raises(ValueError, match=r"poses of 11 joints .* got \(4, 10, 3\)"):
+        sample_poses(torch.randn(4, 10, 3), BRANCHED, 2)
+    with pytest.raises(ValueError, match=r"got \(0, 11, 3\)"):
+        sample_poses(torch.randn(0, 11, 3), BRANCHED, 2)
 
 
 def test_sampling_needs_two_identities():

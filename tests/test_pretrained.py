@@ -130,14 +130,6 @@ def exporter():
     del sys.path[:2]
 
 
-@pytest.mark.parametrize("name", pretrained_names())
-def test_a_shipped_card_is_the_one_its_facts_give(exporter, name):
-    folder = ROOT / "meshkit" / "weights"
-    text = exporter.markdown(name, json.loads((folder / f"{name}.json").read_text()))
-    assert text == (folder / f"{name}.md").read_text()
-    assert ("set convolutions" in text) == name.startswith("corenet3d")
-
-
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory):
     """The files of a finished run, of a network that was never trained."""
@@ -202,10 +194,39 @@ def test_export_and_load_again(exporter, finished_run, bodies, tmp_path, monkeyp
 
 @pytest.mark.parametrize("recipe", ["xdualnet", "corenet3d", "npt", "cycle_baseline"])
 def test_recipes_are_told_apart_by_their_settings(exporter, recipe):
+    import run_history
+
     module = importlib.import_module(recipe)
     config = json.loads(json.dumps(asdict(module.PRESETS["tiny"]), default=str))
     assert exporter.recipe_of(config) == recipe
-    assert exporter.command(config).startswith(f"python recipes/{recipe}.py --preset tiny --data humans --seed 0")
+    assert run_history.command(config).startswith(f"python recipes/{recipe}.py --preset tiny --data humans --seed 0")
+
+
+def test_a_run_that_began_with_others_has_their_commands(exporter, finished_run, tmp_path):
+    from run_history import runs
+
+    def begun(name, **changes):
+        folder = tmp_path / name
+        folder.mkdir()
+        for path in finished_run[0].glob("*.json"):
+            (folder / path.name).write_bytes(path.read_bytes())
+        config = json.loads((folder / "config.json").read_text())
+        (folder / "config.json").write_text(json.dumps(config | changes))
+        return folder
+
+    shipped = json.loads((ROOT / "meshkit" / "weights" / "xdualnet-humans.json").read_text())
+    first = begun("first", init="xdualnet-humans", seed=1)
+    second = begun("second", init=str(first), seed=2)
+    found = runs(second, "new")
+    assert [run["seed"] for run in found] == [shipped["seed"], 1, 2]
+    assert found[0]["command"] == f"{shipped['command']} --name new-1"
+    assert found[0]["machine"] == shipped["machine"]
+    for number, run in enumerate(found[1:], 1):
+        assert run["command"].endswith(f" --no-corr --init runs/new-{number} --name new-{number + 1}")
+    assert "--name" not in runs(finished_run[0], "new")[0]["command"]
+    (first / "config.json").unlink()
+    with pytest.raises(OSError, match="first"):
+        runs(second, "new")
 
 
 def test_a_run_of_no_known_recipe_is_refused(exporter, finished_run, tmp_path, monkeypatch):
@@ -220,12 +241,16 @@ def test_a_run_of_no_known_recipe_is_refused(exporter, finished_run, tmp_path, m
 
 
 def test_the_cards_that_ship_are_as_the_exporter_writes_them(exporter):
+    from weights_page import markdown
+
     assert set(pretrained_names()) == {"corenet3d-humans", "xdualnet-animals", "xdualnet-humans"}
     for name in pretrained_names():
         card = json.loads((ROOT / "meshkit" / "weights" / f"{name}.json").read_text())
         text = (ROOT / "meshkit" / "weights" / f"{name}.md").read_text()
-        assert text == exporter.markdown(name, card)
+        assert text == markdown(name, card)
         assert ("metres" in text) == (card["data"] == "humans")
+        assert ("set convolutions" in text) == name.startswith("corenet3d")
+        assert all(run["command"] in text for run in (*card.get("before", ()), card))
 
 
 def test_a_folder_without_a_run_is_refused(exporter, tmp_path, monkeypatch):

@@ -263,15 +263,33 @@ def test_sampled_identities_join_the_training_ones_alone(run: Any, without_repor
     assert torch.equal(again.identities, body.identities)
 
 
-def test_fewer_than_no_sampled_identities_are_refused(run: Any) -> None:
-    with pytest.raises(recipe_module("_run").UserError, match="--sampled-identities must not be negative, got -3"):
-        run("corenet3d", "--sampled-identities", -3, "--steps", 1)
+def test_sampled_poses_join_the_training_ones_alone(run: Any, without_report: None) -> None:
+    folder = run("corenet3d", "--sampled-poses", 30, "--steps", 1, *SMALL_EXTRACTOR, *WITHOUT_DESCRIPTORS)
+    assert read_json(folder / "config.json")["sampled_poses"] == 30
+    data = recipe_module("_data")
+    body, split = load_shipped("humans")
+    known = body.poses
+    body, wider = data.with_sampled_poses(body, split, 30, seed=0)
+    assert torch.equal(body.poses[: len(known)], known) and torch.equal(wider.test_poses, split.test_poses)
+    assert torch.equal(wider.train_poses[:-30], split.train_poses)
+    # Each joint turns as in a training pose.
+    new, train = body.poses[wider.train_poses[-30:]], known[split.train_poses]
+    assert bool((new[:, None] == train).all(3).any(1).all())
+    again = data.with_sampled_poses(load_shipped("humans")[0], split, 30, seed=0)[0]
+    assert torch.equal(again.poses, body.poses)
 
 
-def test_sampled_identities_need_a_rig(run: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("what", ["identities", "poses"])
+def test_fewer_than_no_samples_are_refused(what: str, run: Any) -> None:
+    with pytest.raises(recipe_module("_run").UserError, match=f"--sampled-{what} must not be negative, got -3"):
+        run("corenet3d", f"--sampled-{what}", -3, "--steps", 1)
+
+
+@pytest.mark.parametrize("what", ["identities", "poses"])
+def test_samples_need_a_rig(what: str, run: Any, tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
-    with pytest.raises(recipe_module("_run").UserError, match="--sampled-identities needs a rig"):
-        run("corenet3d", "--data", f"folder:{tmp_path / 'meshes'}", "--sampled-identities", 5, *WITHOUT_DESCRIPTORS)
+    with pytest.raises(recipe_module("_run").UserError, match=f"--sampled-{what} needs a rig"):
+        run("corenet3d", "--data", f"folder:{tmp_path / 'meshes'}", f"--sampled-{what}", 5, *WITHOUT_DESCRIPTORS)
 
 
 def test_files_and_signatures_do_not_go_together(run: Any, tmp_path: Path) -> None:

@@ -4,44 +4,36 @@
 
 Writes meshkit/weights/NAME.safetensors (the residual blocks as float16, the rest as float32), NAME.json and NAME.md,
 after checking that the network with rounded parameters gives the run's vertices within a thousandth of a metre, and
-measuring what is usual on unseen bodies for the transfer's report (tools/measure_usual.py).
+measuring what is usual on unseen bodies for the transfer's report (tools/measure_usual.py). The card has the command
+of the run, and of those that it began with (``--init``).
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import re
-import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from measure_usual import PAIRS, measure
+from run_history import SYSTEMS, recipe_of, runs
 from safetensors.torch import save_file
 from weights_page import LENGTHS, UNITS, write_card
 
 from meshkit.batching import center
-from meshkit.data import load_shipped
+from meshkit.data import Split, load_shipped
 from meshkit.io import atomic_write
 from meshkit.metrics import pmd
-from meshkit.models import PretrainedTransfer, load_generator, pretrained_names
+from meshkit.models import PretrainedTransfer, load_generator
 from meshkit.transfer import usual_range
 
 ROOT = Path(__file__).parents[1]
 WEIGHTS = ROOT / "meshkit" / "weights"
 TOLERANCE = 1e-3  # metres
 MATCHING = ("extractor.", "theta.", "phi.")
-SYSTEMS = {  # by recipe: a setting that no other recipe has, and what the recipe trains
-    "xdualnet": ("lambda_corr", "X-DualNet (unsupervised)"),
-    "cycle_baseline": ("lambda_cycle", "Cycle and self reconstruction (unsupervised)"),
-    "npt": ("variant", "NPT (supervised)"),
-    "corenet3d": ("norm", "3D-CoreNet (supervised)"),
-}
-IGNORED = {"preset", "out", "name", "resume", "apply", "result", "threads", "accelerator", "data", "seed", "workers"}
 LICENCES = {
     "humans": {
         "id": "Apache-2.0",
@@ -87,50 +79,13 @@ def errors(run: PretrainedTransfer, body: Any, pairs: torch.Tensor) -> list[floa
     return found
 
 
-def recipe_of(config: dict[str, Any]) -> str:
-    """The recipe that a run's settings are of.
-
-    Raises:
-        ValueError: none, or several.
-    """
-    found = [name for name, (own, _) in SYSTEMS.items() if own in config]
-    if len(found) != 1:
-        raise ValueError(f"its settings are not those of one of {', '.join(SYSTEMS)}")
-    return found[0]
-
-
-def command(config: dict[str, Any]) -> str:
-    """The command that repeats the run: its recipe, preset, and what differs from the preset."""
-    sys.path.insert(0, str(ROOT / "recipes"))
-    recipe: Any = importlib.import_module(recipe_of(config))
-    words = [f"python recipes/{recipe.__name__}.py --preset {config['preset']} --data {config['data']}"]
-    words.append(f"--seed {config['seed']}")
-    preset = json.loads(json.dumps(asdict(recipe.PRESETS[config["preset"]]), default=str))
-    words += differences(preset, {k: v for k, v in config.items() if k not in IGNORED}, "")
-    return " ".join(words)
-
-
-def differences(preset: dict[str, Any], config: dict[str, Any], prefix: str) -> list[str]:
-    words = []
-    for key, value in config.items():
-        if value == preset.get(key) or (key == "minutes" and config.get("steps") is not None):
-            continue
-        flag = f"{prefix}{key.replace('_', '-')}"
-        if isinstance(value, dict):
-            words += differences(preset[key], value, f"{flag}.")
-        elif isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--{prefix}no-{key.replace('_', '-')}")
-        elif isinstance(value, list):
-            words.append(f"--{flag} {' '.join(map(str, value))}")
-        else:
-            words.append(f"--{flag} {value}")
-    return words
-
-
-def drawn(config: dict[str, Any]) -> str:
-    """What to say of identities that were drawn for the run."""
-    count = config.get("sampled_identities", 0)
-    return f", {count} more drawn from their Gaussian," if count else ""
+def trained_on(config: dict[str, Any], split: Split) -> str:
+    """Identities and poses of a run, and how many were made of them."""
+    drawn, mixed = config.get("sampled_identities", 0), config.get("sampled_poses", 0)
+    return (
+        f"{len(split.train_identities)} identities{f', {drawn} more drawn from their Gaussian,' if drawn else ''} and "
+        f"{len(split.train_poses)} poses{f', {mixed} more put together from their limbs,' if mixed else ''}"
+    )
 
 
 def main() -> None:
@@ -142,13 +97,10 @@ def main() -> None:
     args = parser.parse_args()
     try:
         generator, model = load_generator(args.run)
-        config, summary, machine = (
-            json.loads((args.run / f"{part}.json").read_text()) for part in ("config", "summary", "machine")
-        )
-        if config.get("init") not in (None, *pretrained_names()):
-            raise ValueError(f"it began with --init {config['init']}, which others do not have")
+        config, summary = (json.loads((args.run / f"{part}.json").read_text()) for part in ("config", "summary"))
         body, split = load_shipped(config["data"], config["vertices"])
         system = SYSTEMS[recipe_of(config)][1]
+        *before, last = runs(args.run, args.name)
     except (OSError, ValueError) as error:
         raise SystemExit(f"error: {args.run} is not a finished run on shipped bodies: {error}") from None
     state = rounded(generator.state_dict(), {key for key, _ in generator.named_parameters()})
@@ -165,23 +117,16 @@ def main() -> None:
         "name": args.name,
         "system": system,
         "preset": config["preset"],
-        "command": command(config),
-        "seed": config["seed"],
+        **({"before": before} if before else {}),
+        **last,
         "data": config["data"],
         "vertices": len(body.template),
-        "split": f"{len(split.train_identities)} identities{drawn(config)} and {len(split.train_poses)} poses to train "
-        "on; tested on "
+        "split": f"{trained_on(config, split)} to train on; tested on "
         f"{len(split.test_identities)} identities and {len(split.test_poses)} poses not seen in training.",
-        "steps": summary["steps"],
-        "pairs_seen": summary["pairs_seen"],
-        "train_minutes": summary["train_minutes"],
-        "precision": config["precision"],
-        "date": time.strftime("%Y-%m-%d", time.gmtime((args.run / "summary.json").stat().st_mtime)),
         "figures": {in_lengths if k == "correspondence_m" else k: v for k, v in summary["test"].items()},
         "test_pairs": summary["test_pairs"],
         "units": re.sub(r"\bm\b", UNITS[config["data"]][1], summary["units"]),
         "parameters": summary["parameters"],
-        "machine": machine,
         "licence": LICENCES[config["data"]],
         "first_pairs_pmd": errors(run, body, split.test_pairs[:8]),
         "rounding": {moved: round(distance, 6), "pairs": len(pairs)},

@@ -43,12 +43,24 @@ def network(card: dict[str, Any]) -> str:
     return ""
 
 
+def training(card: dict[str, Any]) -> str:
+    """The commands of the runs, one after another, as lines of the card."""
+    lines = []
+    for run in (*card.get("before", ()), card):
+        machine = run["machine"]
+        lines.append(
+            f"""- **Training{", then" if lines else ""}**: `{run["command"]}`
+  ({run["steps"]} steps, {run["pairs_seen"]} pairs, {run["train_minutes"]} minutes on \
+{machine["gpu"] or machine["processor"]}, {run["precision"]}, torch
+  {machine["torch"]}), finished on {run["date"]}.
+"""
+        )
+    return "".join(lines)
+
+
 def markdown(name: str, card: dict[str, Any]) -> str:
     figures = card["figures"]
     rows = "\n".join(f"| {key} | {value} |" for key, value in figures.items())
-    machine = card["machine"]
-    processor = machine["gpu"] or machine["processor"]
-    minutes = card["train_minutes"]
     unit, short = UNITS[card["data"]]
     moved = card["rounding"][LENGTHS[card["data"]][1]]
     distance = f"{1e3 * moved:.3f} mm" if short == "m" else f"{moved:.1e} {short}"
@@ -66,10 +78,7 @@ posed = net(identity, pose, identity_faces=identity_faces, pose_faces=pose_faces
 
 - **Input**: two meshes, z up, facing -y, around {card["vertices"]} vertices each, in {unit};
   `meshkit.transfer` brings others there.
-{network(card)}- **Training**: `{card["command"]}`
-  ({card["steps"]} steps, {card["pairs_seen"]} pairs, {minutes} minutes on {processor}, {card["precision"]}, torch
-  {machine["torch"]}), finished on {card["date"]}.
-- **Split**: {card["split"]}
+{network(card)}{training(card)}- **Split**: {card["split"]}
 - **Size**: {card["parameters"]:,} parameters, those of the residual blocks stored with 16 bits. Rounding them moves no
   vertex of {card["rounding"]["pairs"]} test pairs by more than {distance}.
 - **Licence**: {card["licence"]["id"]}. {card["licence"]["note"]}
