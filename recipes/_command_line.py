@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
+from itertools import takewhile
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -30,11 +31,20 @@ def read(kind: type[T], description: str | None, default: T | None = None) -> T:
     said, words = io.StringIO(), sys.argv[1:]
     try:
         with redirect_stderr(said):
-            return tyro.cli(kind, description=description, **options)
+            settings = tyro.cli(kind, description=description, **options)
     except SystemExit as end:
         if end.code != 2:  # --help
             raise
         raise UserError(f"{mistake(kind, words, said.getvalue())}; --help lists the options") from None
+    known = accepted(kind)
+    for name in typed(kind, words):
+        value = settings
+        for part in name.split("."):
+            value = getattr(value, part)
+        if value == ():
+            flag = f"--{name}".replace("_", "-")
+            raise UserError(f"{flag} takes {meaning(known[name]).rstrip(',')}, got nothing; --help lists the options")
+    return settings
 
 
 def typed(kind: type, words: Sequence[str]) -> list[str]:
@@ -65,22 +75,32 @@ def setting(word: str, known: dict[str, Any]) -> str | None:
     if not word.startswith("--"):
         return None
     name = word[2:].partition("=")[0].replace("-", "_")
-    return next((n for n in (name, re.sub(r"^(\w+\.)?no_", r"\1", name)) if n in known), None)
+    if name in known:
+        return name
+    positive = re.sub(r"^(\w+\.)?no_", r"\1", name)
+    return positive if known.get(positive) is bool else None
 
 
 def mistake(kind: type, words: Sequence[str], said: str) -> str:
     """What is wrong with a command line, in one line, of which tyro ``said`` in its box what it could not take."""
     known = accepted(kind)
-    for word in words:
-        if word.startswith("--") and word != "--help" and setting(word, known) is None:
-            flag = word.partition("=")[0]
+    for place, word in enumerate(words):
+        if not word.startswith("--") or word == "--help":
+            continue
+        flag, given, value = word.partition("=")
+        name = setting(word, known)
+        if name is None:
             near = get_close_matches(flag.replace("_", "-"), list(flags(known)), n=1)
             return f"there is no option {flag}" + (f": did you mean {near[0]}?" if near else "")
+        if known[name] is bool:
+            values_given = [value] if given else list(takewhile(lambda w: not w.startswith("--"), words[place + 1 :]))
+            if values_given:
+                return f"{flag} takes no value, got {', '.join(map(repr, values_given))}; {off(name)} turns it off"
     inside = " ".join(re.sub(r"[\u2500-\u257f]+", "\n", said).split("\n")[2:])
     text = " ".join(re.sub(r"\[/?bold\]", "", inside).split("For full helptext")[0].split())
     unread = re.match(r"Unrecognized options: (\S+)", text)
     if unread:
-        return f"{unread[1]!r} belongs to no option"
+        return f"{unread[1].rstrip(',')!r} belongs to no option"
     blamed = re.search(r"--[\w.-]*\w", text)
     name = setting(blamed[0], known) if blamed else None
     if blamed is None or name is None:
@@ -92,9 +112,15 @@ def mistake(kind: type, words: Sequence[str], said: str) -> str:
 def flags(known: dict[str, Any]) -> Iterator[str]:
     """The options as they are typed."""
     for name, hint in known.items():
-        before, dot, own = name.rpartition(".")
-        for no in ("", "no-") if hint is bool else ("",):
-            yield f"--{before}{dot}{no}{own}".replace("_", "-")
+        yield f"--{name}".replace("_", "-")
+        if hint is bool:
+            yield off(name)
+
+
+def off(name: str) -> str:
+    """The option that turns a setting off."""
+    before, dot, own = name.rpartition(".")
+    return f"--{before}{dot}no-{own}".replace("_", "-")
 
 
 def values(flag: str, words: Sequence[str]) -> list[str]:
@@ -116,11 +142,9 @@ def meaning(hint: Any) -> str:
     if origin is Literal:
         return " or ".join(", ".join(map(str, inner)).rsplit(", ", 1))
     if origin is tuple and inner[-1] is ...:
-        return f"one or more of {meaning(inner[0])}"
+        return f"one or more values, each {meaning(inner[0])},"
     if origin is tuple and len(set(inner)) == 1:
         return f"{len(inner)} values, each {meaning(inner[0])},"
     if inner:  # a union
         return " or ".join(map(meaning, inner))
-    if hint is bool:
-        return "no value (--no-... turns it off)"
     return KINDS.get(hint, getattr(hint, "__name__", str(hint)))

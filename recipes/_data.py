@@ -189,9 +189,11 @@ def plain_warnings() -> Iterator[None]:
     """Warnings as lines of the error stream, without the place in the code that Python puts around them."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        yield
-    for warning in caught:
-        print(f"warning: {warning.message}", file=sys.stderr)
+        try:
+            yield
+        finally:
+            for warning in caught:
+                print(f"warning: {warning.message}", file=sys.stderr)
 
 
 def tell(stores: list[MeshStore], eval_pairs: int) -> None:

@@ -531,3 +531,11 @@ def test_a_plain_generator_gets_no_keywords_and_a_wrong_one_is_told() -> None:
         DualReconstruction(lambda identity, pose: identity)(a[0], b)
     with pytest.raises(ValueError, match="points must be at least 1"):
         DualReconstruction(lambda identity, pose: identity, points=0)
+
+
+@pytest.mark.parametrize("padded", [False, True])
+def test_the_step_that_the_cuda_tests_compare_runs_here(padded):
+    from test_cuda import step
+
+    loss, gradients = step("cpu", torch.float32, padded=padded)
+    assert loss.isfinite() and all(bool(g.isfinite().all()) for g in gradients)

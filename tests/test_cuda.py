@@ -52,7 +52,7 @@ def step(device: str, dtype: torch.dtype, *, padded: bool = False) -> tuple[Tens
     net, faces = generator(dtype).to(device), body.faces.to(device)
     result = DualReconstruction(net)(**inputs)
     loss = reconstruction_loss(result.reconstruction_a, result.target_a, mask=inputs.get("identity_mask"))
-    loss = loss + reconstruction_loss(result.reconstruction_b, result.target_b, pose_mask=inputs.get("pose_mask"))
+    loss = loss + reconstruction_loss(result.reconstruction_b, result.target_b, mask=inputs.get("pose_mask"))
     loss = loss + backward_correspondence_loss(result.plan, result.target_b, pose_mask=inputs.get("pose_mask"))
     if not padded:
         loss = loss + edge_ratio_loss(result.output, inputs["identity"], faces)

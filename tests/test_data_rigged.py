@@ -245,6 +245,9 @@ def test_sampled_poses_need_poses_of_the_joints():
         sample_poses(torch.randn(4, 10, 3), BRANCHED, 2)
     with pytest.raises(ValueError, match=r"got \(0, 11, 3\)"):
         sample_poses(torch.randn(0, 11, 3), BRANCHED, 2)
+    for parents in ([-1, 0, 1, -1, 3], [3, 0, 1, -1, 2]):
+        with pytest.raises(ValueError, match="joint 0 must be the root"):
+            sample_poses(torch.randn(4, 5, 3), torch.tensor(parents), 2)
 
 
 def test_sampling_needs_two_identities():

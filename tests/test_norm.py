@@ -554,6 +554,37 @@ def test_a_norm_without_the_constructor_of_its_base_says_so(with_module):
         Own(C, D)
 
 
+def test_the_constructor_that_left_out_its_base_is_the_one_blamed():
+    class Wrong(ConditionalNorm):
+        def __init__(self, num_features, cond_features):
+            self.width = num_features
+
+    class Right(Wrong):
+        def __init__(self, num_features, cond_features):
+            super().__init__(num_features, cond_features)
+
+    with pytest.raises(TypeError, match=r"Wrong.__init__ must begin with"):
+        Right(C, D)
+
+    class Typo(ConditionalNorm):
+        def __init__(self, num_features, cond_features):
+            super().__init__(num_features.width, cond_features)
+
+    with pytest.raises(AttributeError, match="width"):
+        Typo(C, D)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("kind", [ElaIN, SPAdaIN, AdaIN, SoftAdaIN, SPADE])
+def test_half_precision_throughout(kind, dtype):
+    norm = make_any(kind, dtype=torch.float32)
+    x, cond = rand(2, 40, C, dtype=torch.float32), rand(2, 40, D, seed=1, dtype=torch.float32)
+    expected = norm(x, cond)
+    value = norm.to(dtype)(x.to(dtype), cond.to(dtype))
+    assert value.dtype == dtype
+    assert (value.float() - expected).abs().max() < 0.1 * expected.abs().max()
+
+
 def test_other_errors_of_a_constructor_stay_as_they_are():
     class Own(ConditionalNorm):
         def __init__(self, num_features, cond_features):

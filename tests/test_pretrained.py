@@ -216,13 +216,17 @@ def test_a_run_that_began_with_others_has_their_commands(exporter, finished_run,
 
     shipped = json.loads((ROOT / "meshkit" / "weights" / "xdualnet-humans.json").read_text())
     first = begun("first", init="xdualnet-humans", seed=1)
-    second = begun("second", init=str(first), seed=2)
+    second = begun("second", init=str(first), seed=2, sampled_poses=30)
     found = runs(second, "new")
     assert [run["seed"] for run in found] == [shipped["seed"], 1, 2]
     assert found[0]["command"] == f"{shipped['command']} --name new-1"
     assert found[0]["machine"] == shipped["machine"]
     for number, run in enumerate(found[1:], 1):
         assert run["command"].endswith(f" --no-corr --init runs/new-{number} --name new-{number + 1}")
+    assert ("--sampled-poses 30" in found[1]["command"], "--sampled-poses 30" in found[2]["command"]) == (False, True)
+    assert "and 850 poses, 30 more put together" in exporter.trained_on(found, exporter.load_shipped("humans")[1])
+    with pytest.raises(ValueError, match=r"trained on animals, but began with .*second, of humans"):
+        runs(begun("third", init=str(second), data="animals"), "new")
     assert "--name" not in runs(finished_run[0], "new")[0]["command"]
     (first / "config.json").unlink()
     with pytest.raises(OSError, match="first"):

@@ -79,9 +79,9 @@ def errors(run: PretrainedTransfer, body: Any, pairs: torch.Tensor) -> list[floa
     return found
 
 
-def trained_on(config: dict[str, Any], split: Split) -> str:
-    """Identities and poses of a run, and how many were made of them."""
-    drawn, mixed = config.get("sampled_identities", 0), config.get("sampled_poses", 0)
+def trained_on(done: list[dict[str, Any]], split: Split) -> str:
+    """Identities and poses of runs, and how many were made of them."""
+    drawn, mixed = (sum(run.get("sampled", {}).get(what, 0) for run in done) for what in ("identities", "poses"))
     return (
         f"{len(split.train_identities)} identities{f', {drawn} more drawn from their Gaussian,' if drawn else ''} and "
         f"{len(split.train_poses)} poses{f', {mixed} more put together from their limbs,' if mixed else ''}"
@@ -121,7 +121,7 @@ def main() -> None:
         **last,
         "data": config["data"],
         "vertices": len(body.template),
-        "split": f"{trained_on(config, split)} to train on; tested on "
+        "split": f"{trained_on([*before, last], split)} to train on; tested on "
         f"{len(split.test_identities)} identities and {len(split.test_poses)} poses not seen in training.",
         "figures": {in_lengths if k == "correspondence_m" else k: v for k, v in summary["test"].items()},
         "test_pairs": summary["test_pairs"],

@@ -13,7 +13,7 @@ from typing import Any
 from meshkit.models import load_pretrained, pretrained_names
 
 ROOT = Path(__file__).parents[1]
-FACTS = ("command", "seed", "steps", "pairs_seen", "train_minutes", "precision", "date", "machine")
+FACTS = ("command", "sampled", "seed", "steps", "pairs_seen", "train_minutes", "precision", "date", "machine")
 """What a card says of each run."""
 SYSTEMS = {  # by recipe: a setting that no other recipe has, and what the recipe trains
     "xdualnet": ("lambda_corr", "X-DualNet (unsupervised)"),
@@ -61,6 +61,7 @@ def _runs(folder: Path) -> list[dict[str, Any]]:
     init = config.pop("init", None)
     own = {
         "command": command(config),
+        "sampled": {what: config.get(f"sampled_{what}", 0) for what in ("identities", "poses")},
         "seed": config["seed"],
         "steps": summary["steps"],
         "pairs_seen": summary["pairs_seen"],
@@ -73,8 +74,18 @@ def _runs(folder: Path) -> list[dict[str, Any]]:
         card = load_pretrained(init).card
         if "before" in card:
             raise ValueError(f"it began with --init {init}, weights of several runs: begin with the last of these runs")
-        return [{fact: card[fact] for fact in FACTS}, own]
-    return [*([] if init is None else _runs(Path(init))), own]
+        check_same_bodies(config, card, f"the weights {init}")
+        return [{fact: card[fact] for fact in FACTS if fact in card}, own]
+    if init is None:
+        return [own]
+    check_same_bodies(config, json.loads((Path(init) / "config.json").read_text()), init)
+    return [*_runs(Path(init)), own]
+
+
+def check_same_bodies(config: dict[str, Any], before: dict[str, Any], name: str) -> None:
+    """A card has one kind of bodies."""
+    if config["data"] != before["data"]:
+        raise ValueError(f"it was trained on {config['data']}, but began with {name}, of {before['data']}")
 
 
 def recipe_of(config: dict[str, Any]) -> str:

@@ -132,8 +132,7 @@ class RiggedModel(nn.Module):
                 raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
             self.register_buffer(name, value, persistent=False)
         ancestry = parents.tolist()
-        if ancestry[0] != -1 or not all(0 <= parent < joint for joint, parent in enumerate(ancestry[1:], 1)):
-            raise ValueError("joint 0 must be the root (parent -1) and every other joint must come after its parent")
+        check_parents(ancestry)
         sums = weights.sum(1, keepdim=True)
         if bool((sums <= 0).any()):
             raise ValueError(
@@ -221,6 +220,12 @@ class RiggedModel(nn.Module):
             f"pose must be (B,) integers, (B, {self.num_joints}, 3) rotation vectors or (B, {self.num_joints}, 3, 3) "
             f"matrices, got {tuple(pose.shape)}"
         )
+
+
+def check_parents(parents: list[int]) -> None:
+    """Check that the skeleton has one root, which comes first, and every joint comes after its parent."""
+    if parents[0] != -1 or not all(0 <= parent < joint for joint, parent in enumerate(parents[1:], 1)):
+        raise ValueError("joint 0 must be the root (parent -1) and every other joint must come after its parent")
 
 
 def _rows(table: Tensor | None, index: Tensor, what: str) -> Tensor:

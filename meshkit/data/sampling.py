@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from meshkit.data.rigged import check_parents
+
 __all__ = ["sample_identities", "sample_poses"]
 
 
@@ -52,10 +54,10 @@ def sample_poses(poses: Tensor, parents: Tensor, count: int, *, generator: torch
 
     .. math:: R'_j = R^{(p_{l(j)})}_j, \qquad p_0, \dots, p_L \sim U\{1, \dots, P\}
 
-    where l(j) is the limb of joint j, 0 for the trunk. The trunk is the path from the root on which every joint carries
-    more than half of all joints, and ends with the first joint that branches without such a child; limbs are what
-    branches off it: legs, arms and head of the shipped humans (a hand moves with its arm), legs, neck and tail of the
-    animals. Joints turn as they do somewhere in the table; that limbs do not meet is not looked after.
+    where l(j) is the limb of joint j, 0 for the trunk. The trunk is the path from the root that goes on to an only
+    child, or to the child that carries more than half of all joints; limbs are what branches off it: legs, arms and
+    head of the shipped humans (a hand moves with its arm), legs, neck and tail of the animals. Joints turn as they do
+    somewhere in the table; that limbs do not meet is not looked after.
 
     Args:
         poses: ``(P, J, 3)`` rotation vectors or ``(P, J, 3, 3)`` rotation matrices, local to each joint.
@@ -67,7 +69,7 @@ def sample_poses(poses: Tensor, parents: Tensor, count: int, *, generator: torch
         ``(count, J, ...)``, as ``poses``.
 
     Raises:
-        ValueError: no poses, or not of these joints.
+        ValueError: no poses, or not of these joints; ``parents`` that do not come first, or several roots.
 
     Example:
         >>> from meshkit.data import load_shipped
@@ -81,6 +83,7 @@ def sample_poses(poses: Tensor, parents: Tensor, count: int, *, generator: torch
             f"a table of poses of {len(parents)} joints (P, {len(parents)}, 3) or (P, {len(parents)}, 3, 3) is needed, "
             f"got {tuple(poses.shape)}"
         )
+    check_parents(parents.tolist())
     limb = _limbs(parents.tolist())
     device = "cpu" if generator is None else generator.device
     donors = torch.randint(len(poses), (count, max(limb) + 1), generator=generator, device=device)

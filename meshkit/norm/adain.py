@@ -206,7 +206,8 @@ class SoftAdaIN(AdaIN):
     def modulation(self, cond: Tensor, mean: Tensor, std: Tensor, *, cond_mask: Tensor | None = None) -> Modulation:
         """The blended statistics."""
         style_mean, style_std = self._style(cond, cond_mask)
-        w = self.weight(torch.cat([style_mean, mean.to(style_mean.dtype)], 2)).to(std.dtype)
+        means = torch.cat([style_mean, mean.to(style_mean.dtype)], 2)
+        w = self.weight(means.to(self.weight.weight.dtype)).to(std.dtype)
         if self.gate == "sigmoid":
             w = w.sigmoid()
         scale = (w * style_std + (1 - w) * std) / std

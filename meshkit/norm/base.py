@@ -125,20 +125,17 @@ def _calling_super(init: Any) -> Any:
 
     @wraps(init)
     def checked(self: ConditionalNorm, *arguments: Any, **options: Any) -> None:
+        left_out = f"{init.__qualname__} must begin with super().__init__(num_features, cond_features)"
         try:
             init(self, *arguments, **options)
         except AttributeError as error:
-            if "_modules" in self.__dict__:
+            if "before Module.__init__() call" not in str(error):
                 raise
-            raise _left_out(self) from error
+            raise TypeError(left_out) from error
         if "num_features" not in self.__dict__:
-            raise _left_out(self)
+            raise TypeError(left_out)
 
     return checked
-
-
-def _left_out(norm: ConditionalNorm) -> TypeError:
-    return TypeError(f"{type(norm).__name__}.__init__ must begin with super().__init__(num_features, cond_features)")
 
 
 def check_gate(gate: str | None) -> None:
