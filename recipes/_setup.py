@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import asdict, replace
 from operator import attrgetter
@@ -47,6 +48,16 @@ def check(cfg: Any) -> None:
         raise UserError(f"--batch {cfg.batch}{times} is more than the --pairs {cfg.pairs} of an epoch")
     if cfg.eval_pairs > 400:
         raise UserError(f"there are 400 test pairs, --eval-pairs asks for {cfg.eval_pairs}")
+    for name in ("lr", "adam_eps"):
+        if not 0 < getattr(cfg, name) < math.inf:
+            raise UserError(f"--{name.replace('_', '-')} must be positive, got {getattr(cfg, name)}")
+    if not all(0 <= beta < 1 for beta in cfg.betas):
+        raise UserError(f"--betas must lie in [0, 1), got {' '.join(map(str, cfg.betas))}")
+    if cfg.warmup < 0:
+        raise UserError(f"--warmup must not be negative, got {cfg.warmup}")
+    for name in (n for n in vars(cfg) if n.startswith("lambda_")):
+        if not 0 <= getattr(cfg, name) < math.inf:
+            raise UserError(f"--{name.replace('_', '-')} must be a weight of at least 0, got {getattr(cfg, name)}")
     for name in ("decay_from", "arap_from"):
         if not 0 <= getattr(cfg, name, 0.0) <= 1:
             raise UserError(f"--{name.replace('_', '-')} is a share of the run, got {getattr(cfg, name)}")

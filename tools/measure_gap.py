@@ -2,8 +2,8 @@
 
     python tools/measure_gap.py corenet3d-humans runs/corenet3d --pairs 50
 
-Takes names of shipped weights and folders of runs. Pairs are drawn anew (--seed), not the fixed test pairs; all weights get
-the same ones.
+Takes names of shipped weights and folders of runs. Pairs are drawn anew (--seed), not the fixed test pairs; all weights
+get the same ones.
 """
 
 from __future__ import annotations

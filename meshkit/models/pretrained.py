@@ -93,9 +93,9 @@ class PretrainedTransfer(nn.Module):
 
         ``identity_descriptors`` and ``pose_descriptors`` are what :meth:`describe` gives, where it was asked already.
         """
-        single = identity.dim() == pose.dim() == 2
         first = self._side(identity, identity_faces, identity_mask, identity_descriptors, "identity")
         second = self._side(pose, pose_faces, pose_mask, pose_descriptors, "pose")
+        single = identity.dim() == pose.dim() == 2
         batch = max(len(first["identity"]), len(second["pose"]))
         inputs = {name: _repeated(value, batch) for name, value in (first | second).items() if value is not None}
         result = self.generator(**inputs)
@@ -127,6 +127,8 @@ class PretrainedTransfer(nn.Module):
         self, verts: Tensor, faces: Tensor | None, mask: Tensor | None, descriptors: Tensor | None, name: str
     ) -> dict[str, Any]:
         """What the generator is told of one of the two meshes, or batches of meshes."""
+        if not isinstance(verts, Tensor):
+            raise TypeError(f"{name} must be a tensor, got {type(verts).__name__}; torch.as_tensor makes one of arrays")
         if verts.dim() not in (2, 3) or verts.shape[-1] != 3:
             raise ValueError(f"{name} must be (V, 3) or (B, V, 3), got {tuple(verts.shape)}")
         verts = (verts if verts.dim() == 3 else verts[None]).to(next(self.generator.parameters()).dtype)

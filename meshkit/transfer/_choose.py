@@ -49,13 +49,14 @@ def choose_weights(
     if weights != "auto":
         return Choice(load_weights(weights, device or "cpu"), os.fspath(weights))
     like = identity().likeness
-    fitting = [net for net in map(load_pretrained, pretrained_names()) if net.card["data"] == like.kind]
+    kind = "humans" if like.neither else like.kind
+    fitting = [net for net in map(load_pretrained, pretrained_names()) if net.card["data"] == kind]
     if not fitting:
-        raise ValueError(f"no weights for {like.kind} come with this installation: name some, or the folder of a run")
+        raise ValueError(f"no weights for {kind} come with this installation: name some, or the folder of a run")
     best = min(fitting, key=lambda net: net.card["figures"]["pmd"])
-    reason = f"as the identity's shape is that of {like.kind}"
+    reason = f"as the identity's shape is that of {kind}"
     if not like.clear:
-        reason = f"those for {like.kind}, as the identity's shape is {'of neither kind' if like.neither else 'unclear'}"
+        reason = f"those for {kind}, as the identity's shape is {'of neither kind' if like.neither else 'unclear'}"
     return Choice(best.to(device or "cpu"), f"{best.card['name']}, {reason}")
 
 

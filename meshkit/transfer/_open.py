@@ -71,7 +71,11 @@ def read(mesh: Mesh, role: str) -> tuple[str, Tensor, Tensor, tuple[str, ...]]:
             verts, faces = load_mesh(mesh)
         return os.fspath(mesh), verts, faces, tuple(str(w.message) for w in caught)
     if not (isinstance(mesh, tuple) and len(mesh) == 2 and all(isinstance(part, Tensor) for part in mesh)):
-        raise ValueError(f"{role} must be a path or a tuple (verts, faces) of tensors, got {type(mesh).__name__}")
+        parts = ", ".join(type(part).__name__ for part in mesh) if isinstance(mesh, tuple) else None
+        raise ValueError(
+            f"{role} must be a path or a tuple (verts, faces) of two tensors, got "
+            f"{type(mesh).__name__ if parts is None else f'({parts})'}; torch.as_tensor makes tensors of arrays"
+        )
     return role, mesh[0].detach(), mesh[1], ()
 
 
