@@ -7,6 +7,7 @@ transfer must be a rigid motion of the identity mesh into the frame and place of
 import itertools
 import json
 import math
+import os
 import re
 import struct
 import sys
@@ -45,6 +46,7 @@ from meshkit.transfer._open import named, open_mesh
 from meshkit.transfer._units import find_scale, scale_to
 from meshkit.transfer.command import main, parser
 from meshkit.transfer.confidence import roughness, row_entropies
+from meshkit.transfer.report import Doubt
 
 UPRIGHT = {"identity_up": "+z", "identity_facing": "-y", "pose_up": "+z", "pose_facing": "-y"}
 Mesh = tuple[Tensor, Tensor]
@@ -640,6 +642,60 @@ def test_the_command_says_each_doubt_once(quiet, person, moves, tmp_path, monkey
     assert said.count("far from the size of the training bodies") == 1
 
 
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_doubt_with_other_numbers_is_said_once_and_of_its_own_mesh(
+    quiet, person, moves, tmp_path, monkeypatch, capsys
+):
+    limits = {"identity_roughness": {"median": 0.0, "limit": 0.001}, "pose_roughness": {"median": 0.0, "limit": 0.001}}
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data="humans", usual=limits))
+    identity = tmp_path / "id.obj"
+    save_mesh(identity, 3 * person[0], person[1])
+    for number, frame in enumerate(moves[0]):
+        save_mesh(tmp_path / "poses" / f"{number}.obj", frame, moves[1])
+    axes = [*(f"--{name.replace('_', '-')}={axis}" for name, axis in UPRIGHT.items()), "--identity-unit=m"]
+    words = [*axes, "--weights", "copy", "--no-picture", "--no-html", *(["--quiet"] if quiet else [])]
+    command(identity, tmp_path / "poses", "-o", tmp_path / "out.npz", *words)
+    out, err = capsys.readouterr()
+    for what in ("the pose mesh's surface is rough", "the identity mesh's surface is rough", "far from the size"):
+        assert (out + err).count(what) == 1
+    first = os.fspath(tmp_path / "poses" / "0.obj")
+    if quiet:
+        starts = (f"{identity}: far", f"{identity}: the identity mesh's surf", f"{first}: the pose mesh's surface is")
+        assert all(line.startswith(f"unusual: {start}") for line, start in zip(err.splitlines(), starts, strict=True))
+    results = list(transfer_sequence(identity, tmp_path / "poses", weights=copier(usual=limits), **UPRIGHT))
+    assert len({result.report.confidence.pose_roughness for result in results}) == 3, "three numbers, one warning"
+
+
+def test_a_doubt_that_begins_later_is_said_of_that_pose(person, moves, tmp_path, monkeypatch, capsys):
+    smooth, rough = (Confidence(None, None, 0.1, None, None, 0.1, number) for number in (0.1, 0.3))
+    numbers = iter((smooth, rough, replace(rough, pose_roughness=0.4)))
+    monkeypatch.setattr("meshkit.transfer.transfer.measure_confidence", lambda *_, **__: next(numbers))
+    monkeypatch.setattr(
+        choose, "load_weights", lambda *_: copier(usual={"pose_roughness": {"median": 0.1, "limit": 0.2}})
+    )
+    save_mesh(tmp_path / "id.obj", *person)
+    for number, frame in enumerate(moves[0]):
+        save_mesh(tmp_path / "poses" / f"{number}.obj", frame, moves[1])
+    axes = [f"--{name.replace('_', '-')}={axis}" for name, axis in UPRIGHT.items()]
+    words = [*axes, "--weights", "copy", "--no-picture", "--no-html"]
+    command(tmp_path / "id.obj", tmp_path / "poses", "-o", tmp_path / "out.npz", *words)
+    (said,) = [line for line in capsys.readouterr().out.splitlines() if "is rough" in line]
+    assert said.startswith(f"unusual: {tmp_path / 'poses' / '1.obj'}: the pose mesh's surface is rough: 0.300 (")
+
+
+def test_the_page_of_a_sequence_has_the_headline_of_what_the_first_pose_is_doubted_for(
+    person, moves, tmp_path, monkeypatch
+):
+    notes = []
+    monkeypatch.setattr("meshkit.transfer.output.save_html", lambda *_, **options: notes.extend(options["notes"]))
+    giants = [(3 * v, moves[1]) for v in moves[0]]
+    net = copier(data="humans", usual=WIDE)
+    *_, last = transfer_sequence(person, giants, weights=net, pose_unit="m", **UPRIGHT)
+    save_page(tmp_path / "x.html", last)
+    assert notes[2] == "pose: far from the size of the training bodies in the unit given, m"
+    assert last.report.warnings[0].startswith("pose 2: far from the size"), "the doubt of the pose that it is said of"
+
+
 def test_what_the_reader_says_of_the_first_pose_is_kept(person, moves, tmp_path):
     (a, b, c), *others = (moves[1] + 1).tolist()
     beside = next(face for face in others if {a, b} < set(face))
@@ -822,7 +878,7 @@ def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypa
 
     monkeypatch.setattr("meshkit.transfer.output.contact_sheet", sheet)
     result = transfer_pose(person, person, weights=copier(), **UPRIGHT)
-    report = replace(result.report, warnings=("odd",) * count)
+    report = replace(result.report, doubts=(Doubt("", "odd"),) * count)
     save_picture(tmp_path / "x.png", [replace(result, report=report)], size=20)
     assert seen[0][2] == (f"{said} the report" if said else "")
 
@@ -833,8 +889,9 @@ def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, mon
     result = transfer_pose(person, mover, weights=copier(), **UPRIGHT)
     numbers = Confidence(0.9, 0.1, 0.1, None, None, 0.2, 0.3)
     limits = {name: {"median": 0.1, "limit": 0.15} for name in ("match_spread", "mutual_share", "pose_roughness")}
-    texts = ("pose: axes in doubt (up +z, facing -y): give them if they are wrong", *numbers.warnings(limits))
-    save_page(tmp_path / "x.html", replace(result, report=replace(result.report, warnings=texts)))
+    doubts = [Doubt("pose", "axes in doubt (up +z, facing -y): give them if they are wrong")]
+    doubts += [Doubt("pose" if "pose mesh's" in text else "", text) for text in numbers.warnings(limits)]
+    save_page(tmp_path / "x.html", replace(result, report=replace(result.report, doubts=doubts)))
     assert notes[2] == (
         "pose: axes in doubt; the network is unsure which places of the two meshes correspond, so limbs may go astray; "
         "few vertices of the two meshes are each other's best match; the pose mesh's surface is rough"

@@ -18,7 +18,7 @@ from meshkit.transfer._choose import Weights
 from meshkit.transfer._frames import turns_about
 from meshkit.transfer._open import Mesh, examine, named, read
 from meshkit.transfer._orient import find_rotation
-from meshkit.transfer._prepare import Prepared, axes_doubt
+from meshkit.transfer._prepare import Prepared
 from meshkit.transfer.report import TransferResult
 from meshkit.transfer.transfer import PoseTransfer
 
@@ -214,10 +214,8 @@ class _Follower:
         small = clean.verts if first.simple.method == "none" else self._binding.carry(clean.verts)
         simple = replace(first.simple, verts=small, original=clean.verts)
         descriptors = named(name, lambda: transfer.net.describe(small, simple.faces))
-        rotation, doubts, rest = before.rotation, first.doubts, transfer.rest
+        rotation, clear, rest = before.rotation, before.clear, transfer.rest
         if self._turns and rest is not None and hasattr(transfer.net.generator, "match"):
-            # What was in doubt about the first one's axes is asked anew.
-            doubts = tuple(doubt for doubt in doubts if doubt != axes_doubt(first.name, first.rotation))
             rotation, clear = named(
                 name,
                 lambda: find_rotation(
@@ -229,7 +227,5 @@ class _Follower:
                     usual=before.rotation[None],
                 ),
             )
-            if not clear:
-                doubts += (axes_doubt(name, rotation),)
         current = replace(first, opened=replace(first.opened, name=name), clean=clean, simple=simple)
-        return replace(current, descriptors=descriptors, doubts=doubts, rotation=rotation.to(small))
+        return replace(current, descriptors=descriptors, clear=clear, rotation=rotation.to(small))
