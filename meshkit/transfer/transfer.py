@@ -114,7 +114,7 @@ class PoseTransfer:
         """
         own, net = self.identity, self.net
         output, numbers = named(f"{own.name}, {other.name}", lambda: run_network(net, own, other))
-        small = output.vertices
+        small = output.vertices.to(own.verts)  # of weights in another dtype
         if not bool(torch.isfinite(small).all()):
             raise ValueError(f"{other.name}: the network's result is not finite; the weights cannot do this pair")
         if self.refine is not None:
@@ -184,7 +184,9 @@ def run_network(net: PretrainedTransfer, identity: Prepared, pose: Prepared) -> 
     pair = identity.verts, pose.verts
     faces = {"identity_faces": identity.simple.faces, "pose_faces": pose.simple.faces}
     one, two = identity.descriptors, pose.descriptors
-    output = net.output(*pair, **faces, identity_descriptors=one, pose_descriptors=two)
+    dtype = next(net.parameters()).dtype
+    first, second = (None if described is None else described.to(dtype) for described in (one, two))
+    output = net.output(*pair, **faces, identity_descriptors=first, pose_descriptors=second)
     numbers = measure_confidence(net, *pair, **faces, output=output, identity_descriptors=one, pose_descriptors=two)
     return output, numbers
 
