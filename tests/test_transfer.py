@@ -264,7 +264,12 @@ def test_unusual_numbers_are_put_into_words():
     assert rough["pose_roughness"] == {"median": 0.15, "limit": 0.199} and "match_spread" not in rough
     texts = Confidence(None, None, 0.1, None, None, 0.2, 0.3).warnings(rough)
     assert [text[:25] for text in texts] == ["the identity mesh's surfa", "the pose mesh's surface i"]
-    assert all("is rough" in text and "smooth the mesh first" in text for text in texts)
+    assert all(
+        text.endswith(
+            "noise of a scan, or too few vertices (fewer than the weights want): smooth the scan, or take a finer mesh"
+        )
+        for text in texts
+    )
     with pytest.raises(ValueError, match="needs measured pairs"):
         usual_range([])
 
@@ -359,7 +364,10 @@ def test_what_is_no_body_is_neither_and_of_no_unit(kind, person):
         report = transfer_pose(*pair, weights=net, **UPRIGHT).report
         (said,) = report.warnings
         assert said.startswith(f"the {role} mesh has the shape of neither a person nor a four-legged animal (distance ")
-        assert "expect no sensible result; use one surface that is a body" in said
+        assert said.endswith(
+            "expect no sensible result; use one whole body as one surface, smoothed if it is a noisy scan, without "
+            "clothes or props"
+        )
         prepared = getattr(report, role)
         assert prepared.scale.unit == "unknown" and "unit unknown, scaled by " in str(prepared)
         assert "if this is a body" not in str(report) and "guessed" not in str(prepared)
@@ -608,6 +616,29 @@ def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
     assert all("pose mesh has the shape of animals" in result.report.warnings[1] for result in results)
 
 
+@pytest.mark.parametrize(
+    ("given", "count"), [({"pose_up": "+z"}, 3), ({"pose_facing": "-y"}, 3), ({}, 7), ({"pose_up": "-x"}, 3)]
+)
+def test_an_axis_that_was_given_holds_for_every_pose(given, count, person, moves, monkeypatch):
+    net = copier(data="humans", usual=WIDE)
+    net.generator.match = None
+    asked = []
+
+    def find(*_, candidates, **__):
+        asked.append(len(candidates))
+        return candidates[-1], True  # not the one before
+
+    monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", find)
+    monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", find)
+    poses = [(v, moves[1]) for v in moves[0]]
+    results = transfer_sequence(person, poses, weights=net, identity_up="+z", identity_facing="-y", **given)
+    found = [result.report.pose.rotation for result in results]
+    assert asked[1:] == [count, count] and not torch.equal(found[0], found[1])
+    for rotation in found:
+        assert given.get("pose_up") in (None, axis_name(rotation[2]))
+        assert given.get("pose_facing") in (None, axis_name(-rotation[1]))
+
+
 def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatch):
     net = copier(data="humans", usual=WIDE)
     net.generator.match = None  # find_rotation, which would call it, is replaced
@@ -617,7 +648,9 @@ def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatc
     axes = {name: axis for name, axis in UPRIGHT.items() if name != "pose_facing"}
     results = transfer_sequence(person, [(v, moves[1]) for v in moves[0]], weights=net, **axes)
     said = "pose 1: axes in doubt (up +z, facing -y): give them if they are wrong"
-    assert [result.report.warnings for result in results] == [(), (said,), ()]
+    reports = [result.report for result in results]
+    assert [report.warnings for report in reports] == [(), (said,), ()]
+    assert ["in doubt" in report.pose.found for report in reports] == [False, True, False]
 
 
 def test_doubt_about_the_first_poses_axes_is_not_said_of_later_ones(person, moves, monkeypatch):
@@ -1002,9 +1035,15 @@ def test_wrong_axes_are_noticed_where_they_were_given(fine_transfer):
     assert noticed >= 1
 
 
-def test_the_rest_body_is_described_and_encoded_once(person, mover, monkeypatch):
+def small_net() -> PretrainedTransfer:
+    """Untrained weights with a matching."""
+    torch.manual_seed(0)
     config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16))
-    net = PretrainedTransfer(config.build(), config, card={"data": "humans", "vertices": 1000}).eval()
+    return PretrainedTransfer(config.build(), config, card={"data": "humans", "vertices": 1000}).eval()
+
+
+def test_the_rest_body_is_described_and_encoded_once(person, mover, monkeypatch):
+    net = small_net()
     sizes = []
     encode = net.generator.encode
     monkeypatch.setattr(net.generator, "encode", lambda verts, **_: sizes.append(verts) or encode(verts, **_))
@@ -1014,6 +1053,17 @@ def test_the_rest_body_is_described_and_encoded_once(person, mover, monkeypatch)
         transfer(mover, pose_up="+z")
     same = [verts for verts in sizes if verts.shape[1] == len(rest) and torch.allclose(verts[0], center(rest[None])[0])]
     assert len(same) == 1 and len(sizes) > 12
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_weights_of_another_dtype(dtype, person, mover):
+    """The axes found and the result are as with float32, as far as an untrained network's matching is stable."""
+    net = small_net()
+    expected = transfer_pose(person, mover, weights=net, identity_up="+z", pose_up="+z")
+    result = transfer_pose(person, mover, weights=net.to(dtype), identity_up="+z", pose_up="+z")
+    assert result.verts.dtype == torch.float32
+    assert torch.equal(result.report.pose.rotation, expected.report.pose.rotation)
+    assert_near(result.verts, expected.verts, 0.005 if dtype == torch.float64 else 0.1)
 
 
 @pytest.mark.skipif("xdualnet-animals" not in pretrained_names(), reason="this checkout lacks the weights")
