@@ -7,6 +7,7 @@ transfer must be a rigid motion of the identity mesh into the frame and place of
 import itertools
 import json
 import math
+import os
 import re
 import struct
 import sys
@@ -45,6 +46,7 @@ from meshkit.transfer._open import named, open_mesh
 from meshkit.transfer._units import find_scale, scale_to
 from meshkit.transfer.command import main, parser
 from meshkit.transfer.confidence import roughness, row_entropies
+from meshkit.transfer.report import Doubt
 
 UPRIGHT = {"identity_up": "+z", "identity_facing": "-y", "pose_up": "+z", "pose_facing": "-y"}
 Mesh = tuple[Tensor, Tensor]
@@ -262,7 +264,12 @@ def test_unusual_numbers_are_put_into_words():
     assert rough["pose_roughness"] == {"median": 0.15, "limit": 0.199} and "match_spread" not in rough
     texts = Confidence(None, None, 0.1, None, None, 0.2, 0.3).warnings(rough)
     assert [text[:25] for text in texts] == ["the identity mesh's surfa", "the pose mesh's surface i"]
-    assert all("is rough" in text and "smooth the mesh first" in text for text in texts)
+    assert all(
+        text.endswith(
+            "noise of a scan, or too few vertices (fewer than the weights want): smooth the scan, or take a finer mesh"
+        )
+        for text in texts
+    )
     with pytest.raises(ValueError, match="needs measured pairs"):
         usual_range([])
 
@@ -357,7 +364,10 @@ def test_what_is_no_body_is_neither_and_of_no_unit(kind, person):
         report = transfer_pose(*pair, weights=net, **UPRIGHT).report
         (said,) = report.warnings
         assert said.startswith(f"the {role} mesh has the shape of neither a person nor a four-legged animal (distance ")
-        assert "expect no sensible result; use one surface that is a body" in said
+        assert said.endswith(
+            "expect no sensible result; use one whole body as one surface, smoothed if it is a noisy scan, without "
+            "clothes or props"
+        )
         prepared = getattr(report, role)
         assert prepared.scale.unit == "unknown" and "unit unknown, scaled by " in str(prepared)
         assert "if this is a body" not in str(report) and "guessed" not in str(prepared)
@@ -606,6 +616,29 @@ def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
     assert all("pose mesh has the shape of animals" in result.report.warnings[1] for result in results)
 
 
+@pytest.mark.parametrize(
+    ("given", "count"), [({"pose_up": "+z"}, 3), ({"pose_facing": "-y"}, 3), ({}, 7), ({"pose_up": "-x"}, 3)]
+)
+def test_an_axis_that_was_given_holds_for_every_pose(given, count, person, moves, monkeypatch):
+    net = copier(data="humans", usual=WIDE)
+    net.generator.match = None
+    asked = []
+
+    def find(*_, candidates, **__):
+        asked.append(len(candidates))
+        return candidates[-1], True  # not the one before
+
+    monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", find)
+    monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", find)
+    poses = [(v, moves[1]) for v in moves[0]]
+    results = transfer_sequence(person, poses, weights=net, identity_up="+z", identity_facing="-y", **given)
+    found = [result.report.pose.rotation for result in results]
+    assert asked[1:] == [count, count] and not torch.equal(found[0], found[1])
+    for rotation in found:
+        assert given.get("pose_up") in (None, axis_name(rotation[2]))
+        assert given.get("pose_facing") in (None, axis_name(-rotation[1]))
+
+
 def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatch):
     net = copier(data="humans", usual=WIDE)
     net.generator.match = None  # find_rotation, which would call it, is replaced
@@ -615,7 +648,9 @@ def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatc
     axes = {name: axis for name, axis in UPRIGHT.items() if name != "pose_facing"}
     results = transfer_sequence(person, [(v, moves[1]) for v in moves[0]], weights=net, **axes)
     said = "pose 1: axes in doubt (up +z, facing -y): give them if they are wrong"
-    assert [result.report.warnings for result in results] == [(), (said,), ()]
+    reports = [result.report for result in results]
+    assert [report.warnings for report in reports] == [(), (said,), ()]
+    assert ["in doubt" in report.pose.found for report in reports] == [False, True, False]
 
 
 def test_doubt_about_the_first_poses_axes_is_not_said_of_later_ones(person, moves, monkeypatch):
@@ -638,6 +673,60 @@ def test_the_command_says_each_doubt_once(quiet, person, moves, tmp_path, monkey
     command(tmp_path / "id.obj", tmp_path / "moves.npz", "-o", tmp_path / "out.npz", *words)
     said = "".join(capsys.readouterr())
     assert said.count("far from the size of the training bodies") == 1
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_doubt_with_other_numbers_is_said_once_and_of_its_own_mesh(
+    quiet, person, moves, tmp_path, monkeypatch, capsys
+):
+    limits = {"identity_roughness": {"median": 0.0, "limit": 0.001}, "pose_roughness": {"median": 0.0, "limit": 0.001}}
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data="humans", usual=limits))
+    identity = tmp_path / "id.obj"
+    save_mesh(identity, 3 * person[0], person[1])
+    for number, frame in enumerate(moves[0]):
+        save_mesh(tmp_path / "poses" / f"{number}.obj", frame, moves[1])
+    axes = [*(f"--{name.replace('_', '-')}={axis}" for name, axis in UPRIGHT.items()), "--identity-unit=m"]
+    words = [*axes, "--weights", "copy", "--no-picture", "--no-html", *(["--quiet"] if quiet else [])]
+    command(identity, tmp_path / "poses", "-o", tmp_path / "out.npz", *words)
+    out, err = capsys.readouterr()
+    for what in ("the pose mesh's surface is rough", "the identity mesh's surface is rough", "far from the size"):
+        assert (out + err).count(what) == 1
+    first = os.fspath(tmp_path / "poses" / "0.obj")
+    if quiet:
+        starts = (f"{identity}: far", f"{identity}: the identity mesh's surf", f"{first}: the pose mesh's surface is")
+        assert all(line.startswith(f"unusual: {start}") for line, start in zip(err.splitlines(), starts, strict=True))
+    results = list(transfer_sequence(identity, tmp_path / "poses", weights=copier(usual=limits), **UPRIGHT))
+    assert len({result.report.confidence.pose_roughness for result in results}) == 3, "three numbers, one warning"
+
+
+def test_a_doubt_that_begins_later_is_said_of_that_pose(person, moves, tmp_path, monkeypatch, capsys):
+    smooth, rough = (Confidence(None, None, 0.1, None, None, 0.1, number) for number in (0.1, 0.3))
+    numbers = iter((smooth, rough, replace(rough, pose_roughness=0.4)))
+    monkeypatch.setattr("meshkit.transfer.transfer.measure_confidence", lambda *_, **__: next(numbers))
+    monkeypatch.setattr(
+        choose, "load_weights", lambda *_: copier(usual={"pose_roughness": {"median": 0.1, "limit": 0.2}})
+    )
+    save_mesh(tmp_path / "id.obj", *person)
+    for number, frame in enumerate(moves[0]):
+        save_mesh(tmp_path / "poses" / f"{number}.obj", frame, moves[1])
+    axes = [f"--{name.replace('_', '-')}={axis}" for name, axis in UPRIGHT.items()]
+    words = [*axes, "--weights", "copy", "--no-picture", "--no-html"]
+    command(tmp_path / "id.obj", tmp_path / "poses", "-o", tmp_path / "out.npz", *words)
+    (said,) = [line for line in capsys.readouterr().out.splitlines() if "is rough" in line]
+    assert said.startswith(f"unusual: {tmp_path / 'poses' / '1.obj'}: the pose mesh's surface is rough: 0.300 (")
+
+
+def test_the_page_of_a_sequence_has_the_headline_of_what_the_first_pose_is_doubted_for(
+    person, moves, tmp_path, monkeypatch
+):
+    notes = []
+    monkeypatch.setattr("meshkit.transfer.output.save_html", lambda *_, **options: notes.extend(options["notes"]))
+    giants = [(3 * v, moves[1]) for v in moves[0]]
+    net = copier(data="humans", usual=WIDE)
+    *_, last = transfer_sequence(person, giants, weights=net, pose_unit="m", **UPRIGHT)
+    save_page(tmp_path / "x.html", last)
+    assert notes[2] == "pose: far from the size of the training bodies in the unit given, m"
+    assert last.report.warnings[0].startswith("pose 2: far from the size"), "the doubt of the pose that it is said of"
 
 
 def test_what_the_reader_says_of_the_first_pose_is_kept(person, moves, tmp_path):
@@ -822,7 +911,7 @@ def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypa
 
     monkeypatch.setattr("meshkit.transfer.output.contact_sheet", sheet)
     result = transfer_pose(person, person, weights=copier(), **UPRIGHT)
-    report = replace(result.report, warnings=("odd",) * count)
+    report = replace(result.report, doubts=(Doubt("", "odd"),) * count)
     save_picture(tmp_path / "x.png", [replace(result, report=report)], size=20)
     assert seen[0][2] == (f"{said} the report" if said else "")
 
@@ -833,8 +922,9 @@ def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, mon
     result = transfer_pose(person, mover, weights=copier(), **UPRIGHT)
     numbers = Confidence(0.9, 0.1, 0.1, None, None, 0.2, 0.3)
     limits = {name: {"median": 0.1, "limit": 0.15} for name in ("match_spread", "mutual_share", "pose_roughness")}
-    texts = ("pose: axes in doubt (up +z, facing -y): give them if they are wrong", *numbers.warnings(limits))
-    save_page(tmp_path / "x.html", replace(result, report=replace(result.report, warnings=texts)))
+    doubts = [Doubt("pose", "axes in doubt (up +z, facing -y): give them if they are wrong")]
+    doubts += [Doubt("pose" if "pose mesh's" in text else "", text) for text in numbers.warnings(limits)]
+    save_page(tmp_path / "x.html", replace(result, report=replace(result.report, doubts=doubts)))
     assert notes[2] == (
         "pose: axes in doubt; the network is unsure which places of the two meshes correspond, so limbs may go astray; "
         "few vertices of the two meshes are each other's best match; the pose mesh's surface is rough"
@@ -945,9 +1035,15 @@ def test_wrong_axes_are_noticed_where_they_were_given(fine_transfer):
     assert noticed >= 1
 
 
-def test_the_rest_body_is_described_and_encoded_once(person, mover, monkeypatch):
+def small_net() -> PretrainedTransfer:
+    """Untrained weights with a matching."""
+    torch.manual_seed(0)
     config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16))
-    net = PretrainedTransfer(config.build(), config, card={"data": "humans", "vertices": 1000}).eval()
+    return PretrainedTransfer(config.build(), config, card={"data": "humans", "vertices": 1000}).eval()
+
+
+def test_the_rest_body_is_described_and_encoded_once(person, mover, monkeypatch):
+    net = small_net()
     sizes = []
     encode = net.generator.encode
     monkeypatch.setattr(net.generator, "encode", lambda verts, **_: sizes.append(verts) or encode(verts, **_))
@@ -957,6 +1053,17 @@ def test_the_rest_body_is_described_and_encoded_once(person, mover, monkeypatch)
         transfer(mover, pose_up="+z")
     same = [verts for verts in sizes if verts.shape[1] == len(rest) and torch.allclose(verts[0], center(rest[None])[0])]
     assert len(same) == 1 and len(sizes) > 12
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_weights_of_another_dtype(dtype, person, mover):
+    """The axes found and the result are as with float32, as far as an untrained network's matching is stable."""
+    net = small_net()
+    expected = transfer_pose(person, mover, weights=net, identity_up="+z", pose_up="+z")
+    result = transfer_pose(person, mover, weights=net.to(dtype), identity_up="+z", pose_up="+z")
+    assert result.verts.dtype == torch.float32
+    assert torch.equal(result.report.pose.rotation, expected.report.pose.rotation)
+    assert_near(result.verts, expected.verts, 0.005 if dtype == torch.float64 else 0.1)
 
 
 @pytest.mark.skipif("xdualnet-animals" not in pretrained_names(), reason="this checkout lacks the weights")

@@ -63,8 +63,8 @@ class Likeness(NamedTuple):
         if self.neither:
             return (
                 f"the shape of neither a person nor a four-legged animal (distance {self.distance:.1f} from the nearer "
-                f"kind, where bodies have less than {_FAR:g}): expect no sensible result; use one surface that is a "
-                "body, without clothes or props"
+                f"kind, where bodies have less than {_FAR:g}): expect no sensible result; use one whole body as one "
+                "surface, smoothed if it is a noisy scan, without clothes or props"
             )
         text = "a shape between a person's and an animal's: name the weights of its kind if these are not"
         return "" if self.clear else text

@@ -38,9 +38,8 @@ class RestBody:
         self.net, self.kind = net, kind
 
     def match(self, verts: Tensor, descriptors: Tensor | None) -> TransportPlan | DensePlan:
-        """The matching of a mesh (V, 3), about its middle, to the body."""
-        generator = self._generator
-        return generator.match(generator.encode(verts[None], descriptors=_batched(descriptors)), self._encoded)
+        """The matching of a mesh (V, 3), about its middle, to the body; in the dtype of the weights."""
+        return self._generator.match(self._encode(verts, descriptors), self._encoded)
 
     @cached_property
     def surface(self) -> Tensor:
@@ -50,14 +49,21 @@ class RestBody:
 
     @cached_property
     def _mesh(self) -> tuple[Tensor, Tensor]:
-        weight = next(self.net.parameters())
+        device = next(self.net.parameters()).device
         verts, faces = rest_body(self.kind)
-        return verts.to(weight), faces.to(weight.device)
+        return verts.to(device), faces.to(device)
 
     @cached_property
     def _encoded(self) -> Tensor:
         verts, faces = self._mesh
-        return self._generator.encode(center(verts[None]), descriptors=_batched(self.net.describe(verts, faces)))
+        return self._encode(center(verts[None])[0], self.net.describe(verts, faces))
+
+    def _encode(self, verts: Tensor, descriptors: Tensor | None) -> Tensor:
+        # Meshes are described in float32, whatever the weights compute in: an eigenproblem does not bear bfloat16.
+        dtype = next(self.net.parameters()).dtype
+        return self._generator.encode(
+            verts[None].to(dtype), descriptors=None if descriptors is None else descriptors[None].to(dtype)
+        )
 
     @property
     def _generator(self) -> PoseTransferGenerator:
@@ -137,7 +143,7 @@ def agreements(
     for rotation in candidates.to(verts):
         turned = center((verts @ rotation.T)[None])[0]
         plan = rest.match(turned, descriptors)
-        there = plan.barycentric(rest.surface)[0]
+        there = plan.barycentric(rest.surface)[0].to(turned)
         like = _correlation(turned - turned.mean(0), there[:, :3] - there[:, :3].mean(0))
         rows.append((_correlation(normals @ rotation.T, there[:, 3:]), like - _mean_row_entropy(plan)))
     return torch.tensor(rows)
@@ -146,12 +152,8 @@ def agreements(
 def _mean_row_entropy(plan: TransportPlan | DensePlan) -> float:
     if isinstance(plan, TransportPlan):  # its rows sum to 1 / N each; far cheaper than to write out the matrix
         return float(plan.entropy()[0]) - math.log(plan.shape[1])
-    return float(row_entropies(plan.dense()[0]).mean())
+    return float(row_entropies(plan.dense()[0].float()).mean())
 
 
 def _correlation(a: Tensor, b: Tensor) -> float:
     return float((a * b).sum() / (a.norm() * b.norm()).clamp_min(1e-12))
-
-
-def _batched(descriptors: Tensor | None) -> Tensor | None:
-    return None if descriptors is None else descriptors[None]

@@ -14,7 +14,7 @@ from meshkit.transfer._open import OpenedMesh, named
 from meshkit.transfer._orient import RestBody, agrees, find_rotation
 from meshkit.transfer._units import UNITS, Scale, find_scale, scale_to
 
-__all__ = ["Prepared", "axes_doubt", "prepare"]
+__all__ = ["Prepared", "prepare"]
 
 _GIVEN = "given"
 
@@ -30,9 +30,9 @@ class Prepared:
         descriptors: (N, D) what the weights take of the simple mesh; ``None`` if they take none.
         scale: how its lengths became metres.
         rotation: (3, 3) takes the file's axes to those of the weights.
-        found: how ``rotation`` came about.
+        how: what ``rotation`` rests on.
+        clear: whether ``rotation`` is beyond doubt.
         likeness: the kind of body that it is like; ``None`` if the weights do not say what they are for.
-        doubts: what may be wrong with it, in words.
         notes: what was done or should be known.
     """
 
@@ -42,9 +42,9 @@ class Prepared:
     descriptors: Tensor | None
     scale: Scale
     rotation: Tensor
-    found: str
+    how: str
+    clear: bool
     likeness: Likeness | None
-    doubts: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
@@ -66,6 +66,22 @@ class Prepared:
     def up(self) -> Tensor:
         """(3,) the body's up axis in the file."""
         return self.rotation[2]
+
+    @property
+    def found(self) -> str:
+        """How ``rotation`` came about, and whether that is in doubt."""
+        return self.how if self.clear or self.how == _GIVEN else f"{self.how}, in doubt"
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What may be wrong with its size and axes, in words that do not name it."""
+        found = (self.scale.doubt,) if self.scale.doubt else ()
+        if self.clear:
+            return found
+        axes = f"up {axis_name(self.up)}, facing {axis_name(-self.rotation[1])}"
+        if self.how == _GIVEN:
+            return (*found, f"the axes given ({axes}) seem wrong: leave them out to have them found")
+        return (*found, f"axes in doubt ({axes}): give them if they are wrong")
 
     def carry(self, deformed: Tensor) -> Tensor:
         """(V, 3) all vertices of the file, from the simple ones (N, 3) deformed; in the frame of the weights."""
@@ -134,12 +150,9 @@ def prepare(
         notes += (f"the surface is open ({counted(report.boundary_loops, 'hole')}), which the weights have not seen",)
     descriptors = named(name, lambda: net.describe(simple.verts, simple.faces))
     rest = rest or (None if kind is None else RestBody(net, kind))
-    rotation, found, clear = named(name, lambda: _rotation(report, simple, descriptors, rest, up, facing))
-    doubts: tuple[str, ...] = (f"{name}: {scale.doubt}",) if scale.doubt else ()
-    if not clear:
-        doubts += (axes_doubt(name, rotation, given=found == _GIVEN),)
+    rotation, how, clear = named(name, lambda: _rotation(report, simple, descriptors, rest, up, facing))
     rotation = rotation.to(metric.verts)
-    return Prepared(opened, metric, simple, descriptors, scale, rotation, found, likeness, doubts, notes)
+    return Prepared(opened, metric, simple, descriptors, scale, rotation, how, clear, likeness, notes)
 
 
 def _scale(opened: OpenedMesh, kind: str | None, likeness: Likeness | None, unit: str | None) -> Scale:
@@ -149,14 +162,6 @@ def _scale(opened: OpenedMesh, kind: str | None, likeness: Likeness | None, unit
         return scale_to(area, usual_area)  # the size says nothing about the unit
     among = ("m", "cm", "mm") if kind == "animals" else tuple(UNITS)
     return dataclasses.replace(find_scale(area, usual_area, unit, among=among), metric=kind != "animals")
-
-
-def axes_doubt(name: str, rotation: Tensor, *, given: bool = False) -> str:
-    """What is said of axes that are not clear."""
-    axes = f"up {axis_name(rotation[2])}, facing {axis_name(-rotation[1])}"
-    if given:
-        return f"{name}: the axes given ({axes}) seem wrong: leave them out to have them found"
-    return f"{name}: axes in doubt ({axes}): give them if they are wrong"
 
 
 def _rotation(
@@ -179,5 +184,4 @@ def _rotation(
         return rotations(up, facing)[0], "guessed from symmetry and feet", True
     candidates = rotations(up, facing)
     rotation, clear = find_rotation(rest, simple.verts, simple.faces, descriptors=descriptors, candidates=candidates)
-    found = "found by matching to a rest body" if up is None and facing is None else "partly given"
-    return rotation, found if clear else f"{found}, in doubt", clear
+    return rotation, "found by matching to a rest body" if up is None and facing is None else "partly given", clear

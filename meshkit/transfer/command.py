@@ -163,17 +163,14 @@ def _write_sequence(results: Iterator[TransferResult], args: argparse.Namespace)
 
 
 def _tell(result: TransferResult, args: argparse.Namespace, file: Path | None, *, whole: bool, said: set[str]) -> None:
-    """Print the report, or of a later pose what was not ``said`` of an earlier one."""
+    """Print the report, or of a later pose what has no headline ``said`` of an earlier one."""
     report = result.report
-    news = [warning for warning in report.warnings if warning not in said]
-    said.update(news)
-    if args.quiet:
-        for warning in news:
-            print(f"unusual: {report.pose.name}: {warning}", file=sys.stderr)
-        return
-    if whole:
+    news = [doubt for doubt in report.doubts if doubt.headline not in said]
+    said.update(doubt.headline for doubt in news)
+    if whole and not args.quiet:
         print(report)
-    elif news:
-        print(f"{report.pose.name}: unusual: {'; '.join(news)}")
-    if file is not None:
+    else:
+        for doubt in news:
+            print(f"unusual: {report.blamed(doubt)}: {doubt.text}", file=sys.stderr if args.quiet else sys.stdout)
+    if file is not None and not args.quiet:
         print(f"{file}: {len(result.verts)} vertices")

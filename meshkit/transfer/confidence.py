@@ -17,7 +17,7 @@ __all__ = ["Confidence", "bounds", "measure_confidence", "roughness", "row_entro
 
 _CHECK = "see that both are bodies of the kind that the weights know, and that their axes are right"
 _UNLIKE = "clothes, props, holes and limbs welded together do that; leave them away, or train weights on such meshes"
-_SMOOTH = "if that is the noise of a scan, smooth the mesh first"
+_SMOOTH = "noise of a scan, or too few vertices (fewer than the weights want): smooth the scan, or take a finer mesh"
 
 # Field, whether large values are the unusual ones, how they are written, what an unusual one says, and what to do.
 _MEANINGS = (
@@ -120,7 +120,7 @@ def measure_confidence(
     result: GeneratorOutput = output
     spread = mutual = None
     if result.plan is not None:
-        mass = result.plan.dense()[0]
+        mass = result.plan.dense()[0].float()
         spread = float(row_entropies(mass).exp().mean()) / len(pose)
         forward, backward = mass.argmax(1), mass.argmax(0)
         mutual = float((backward[forward] == torch.arange(len(forward), device=forward.device)).float().mean())

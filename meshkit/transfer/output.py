@@ -1,7 +1,6 @@
 """Pictures and pages of transfers."""
 
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from torch import Tensor
 from meshkit.batching import center
 from meshkit.io import atomic_write
 from meshkit.io.report import counted
-from meshkit.transfer.report import TransferReport, TransferResult
+from meshkit.transfer.report import TransferResult
 from meshkit.viz import contact_sheet, render, save_html
 
 __all__ = ["save_page", "save_picture"]
@@ -39,7 +38,7 @@ def save_picture(path: str | os.PathLike[str], results: Sequence[TransferResult]
         bounds = torch.stack([everything.amin(0), everything.amax(0)])
         rows.append([render(verts, faces, bounds=bounds, size=(size, size)) for verts, faces in views])
         report = result.report
-        count = len(report.warnings)
+        count = len(report.doubts)
         warned = f"{counted(count, 'warning')}: see the report" if count else ""
         captions.append([Path(report.identity.name).name, Path(report.pose.name).name, warned])
     with atomic_write(path) as temporary:
@@ -55,21 +54,9 @@ def save_page(path: str | os.PathLike[str], result: TransferResult) -> None:
     """
     report = result.report
     meshes = dict(zip(_TITLES, _upright(result), strict=True))
-    headlines = "; ".join(_headline(warning, report) for warning in report.warnings)
+    headlines = "; ".join(doubt.headline for doubt in report.doubts)
     notes = [Path(report.identity.name).name, Path(report.pose.name).name, headlines or report.weights]
     save_html(path, meshes, title="Pose transfer", notes=notes)
-
-
-def _headline(warning: str, report: TransferReport) -> str:
-    """What a warning says, without the numbers and the advice, which the report has room for."""
-    for role, mesh in (("identity", report.identity), ("pose", report.pose)):
-        if warning.startswith(f"{mesh.name}: "):
-            return f"{role}: {_first_clause(warning.removeprefix(f'{mesh.name}: '))}"
-    return _first_clause(warning)
-
-
-def _first_clause(text: str) -> str:
-    return re.split(r" \(|[:;]", text, maxsplit=1)[0]
 
 
 def _upright(result: TransferResult) -> list[tuple[Tensor, Tensor]]:

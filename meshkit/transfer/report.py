@@ -1,13 +1,38 @@
 """What a transfer returns: the mesh, what was done, and how far to trust it."""
 
+import re
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from torch import Tensor
 
 from meshkit.transfer._prepare import Prepared
 from meshkit.transfer.confidence import Confidence
 
-__all__ = ["TransferReport", "TransferResult"]
+__all__ = ["Doubt", "TransferReport", "TransferResult"]
+
+
+class Doubt(NamedTuple):
+    """Something unusual or in doubt.
+
+    Attributes:
+        role: ``"identity"`` or ``"pose"``, whichever mesh it is about; empty if it is about the two together.
+        text: what it is, and what to do; it holds no name of a file.
+    """
+
+    role: str
+    text: str
+
+    @property
+    def tells_role(self) -> bool:
+        """Whether the text says itself which mesh it is about, if it is about one."""
+        return not self.role or f"the {self.role} mesh" in self.text
+
+    @property
+    def headline(self) -> str:
+        """What it is and of which mesh, without numbers and advice: the same for every pose that has it."""
+        clause = re.split(r" \(|[:;]", self.text, maxsplit=1)[0]
+        return clause if self.tells_role else f"{self.role}: {clause}"
 
 
 @dataclass(frozen=True)
@@ -19,7 +44,7 @@ class TransferReport:
         pose: the pose mesh likewise.
         weights: which, and why.
         confidence: numbers that tell an ordinary transfer from an unusual one.
-        warnings: what is unusual or in doubt, in words; empty if nothing is.
+        doubts: what is unusual or in doubt; empty if nothing is.
         calibrated: whether the weights' card says what is usual; otherwise there are no warnings from the numbers.
         refined: weight of the network's result in the refinement; ``None`` if there was none.
         seconds: time taken.
@@ -32,12 +57,21 @@ class TransferReport:
     pose: Prepared
     weights: str
     confidence: Confidence
-    warnings: tuple[str, ...]
+    doubts: tuple[Doubt, ...]
     calibrated: bool
     refined: float | None
     seconds: float
     frame: str = ""
     quality: str = ""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The doubts in words, with the name of the mesh where the words do not say which."""
+        return tuple(d.text if d.tells_role else f"{self.blamed(d)}: {d.text}" for d in self.doubts)
+
+    def blamed(self, doubt: Doubt) -> str:
+        """Name of the mesh that a doubt is about; the pose mesh's if it is about the two together."""
+        return self.identity.name if doubt.role == "identity" else self.pose.name
 
     def __str__(self) -> str:
         numbers = self.confidence

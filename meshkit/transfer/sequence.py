@@ -15,10 +15,10 @@ from torch import Tensor
 from meshkit.io import MeshFileError, SurfaceBinding
 from meshkit.io._binary_readers import read_scene
 from meshkit.transfer._choose import Weights
-from meshkit.transfer._frames import turns_about
+from meshkit.transfer._frames import rotations, turns_about
 from meshkit.transfer._open import Mesh, examine, named, read
 from meshkit.transfer._orient import find_rotation
-from meshkit.transfer._prepare import Prepared, axes_doubt
+from meshkit.transfer._prepare import Prepared
 from meshkit.transfer.report import TransferResult
 from meshkit.transfer.transfer import PoseTransfer
 
@@ -132,8 +132,9 @@ def transfer_sequence(
     Work on the identity mesh is done once. Where the pose meshes share their faces, so is the cleaning and simplifying
     of the first one, and the others' vertices follow it; then also unit and size are those of the first. The
     orientation of each is sought among the previous one's and the quarter turns next to it, so that a body may turn
-    around during a sequence; it stays that of the first where ``pose_up`` and ``pose_facing`` are both given, or the
-    weights have no matching to find it with. Every pose is transferred by itself: nothing is smoothed over time.
+    around during a sequence; an axis that was given holds for all. It stays that of the first where ``pose_up`` and
+    ``pose_facing`` are both given, or the weights have no matching to find it with. Every pose is transferred by
+    itself: nothing is smoothed over time.
 
     Args:
         identity: the mesh that gives the body; see :func:`transfer_pose`.
@@ -144,9 +145,9 @@ def transfer_sequence(
         identity_up: of the identity file; found if ``None``.
         identity_facing: likewise.
         identity_unit: likewise.
-        pose_up: of the first pose; found if ``None``.
+        pose_up: of every pose; found if ``None``.
         pose_facing: likewise.
-        pose_unit: likewise.
+        pose_unit: of the first pose; guessed if ``None``.
         device: where to compute.
 
     Yields:
@@ -187,7 +188,7 @@ def transfer_sequence(
         else:
             opened = examine(name, verts, faces, notes)
             current = transfer.prepare(opened, unit=pose_unit, up=pose_up, facing=pose_facing)
-            follower = _Follower(current, verts, turns=pose_up is None or pose_facing is None)
+            follower = _Follower(current, verts, allowed=rotations(pose_up, pose_facing))
         first = first or current
         before = current
         with torch.no_grad():
@@ -197,8 +198,8 @@ def transfer_sequence(
 class _Follower:
     """Later poses of the mesh that was prepared first: the same cleaning and the same simple vertices."""
 
-    def __init__(self, first: Prepared, verts: Tensor, *, turns: bool) -> None:
-        self._first, self._num_verts, self._turns = first, len(verts), turns
+    def __init__(self, first: Prepared, verts: Tensor, *, allowed: Tensor) -> None:
+        self._first, self._num_verts, self._allowed = first, len(verts), allowed
         clean, simple = first.clean, first.simple
         self._binding = SurfaceBinding(simple.verts, simple.faces, clean.verts, clean.faces)
 
@@ -214,10 +215,8 @@ class _Follower:
         small = clean.verts if first.simple.method == "none" else self._binding.carry(clean.verts)
         simple = replace(first.simple, verts=small, original=clean.verts)
         descriptors = named(name, lambda: transfer.net.describe(small, simple.faces))
-        rotation, doubts, rest = before.rotation, first.doubts, transfer.rest
-        if self._turns and rest is not None and hasattr(transfer.net.generator, "match"):
-            # What was in doubt about the first one's axes is asked anew.
-            doubts = tuple(doubt for doubt in doubts if doubt != axes_doubt(first.name, first.rotation))
+        rotation, clear, rest = before.rotation, before.clear, transfer.rest
+        if len(self._allowed) > 1 and rest is not None and hasattr(transfer.net.generator, "match"):
             rotation, clear = named(
                 name,
                 lambda: find_rotation(
@@ -225,11 +224,15 @@ class _Follower:
                     small,
                     simple.faces,
                     descriptors=descriptors,
-                    candidates=turns_about(before.rotation),
+                    candidates=self._candidates(before.rotation),
                     usual=before.rotation[None],
                 ),
             )
-            if not clear:
-                doubts += (axes_doubt(name, rotation),)
         current = replace(first, opened=replace(first.opened, name=name), clean=clean, simple=simple)
-        return replace(current, descriptors=descriptors, doubts=doubts, rotation=rotation.to(small))
+        return replace(current, descriptors=descriptors, clear=clear, rotation=rotation.to(small))
+
+    def _candidates(self, before: Tensor) -> Tensor:
+        """The rotation before and those a quarter turn away, without what contradicts the axes that were given."""
+        turns = turns_about(before)
+        fits = (turns[:, None] == self._allowed.to(turns)).all(-1).all(-1).any(1)
+        return turns[fits]

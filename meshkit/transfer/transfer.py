@@ -15,7 +15,7 @@ from meshkit.transfer._open import Mesh, OpenedMesh, named, open_mesh
 from meshkit.transfer._orient import RestBody
 from meshkit.transfer._prepare import Prepared, prepare
 from meshkit.transfer.confidence import Confidence, measure_confidence
-from meshkit.transfer.report import TransferReport, TransferResult
+from meshkit.transfer.report import Doubt, TransferReport, TransferResult
 
 __all__ = ["PoseTransfer", "transfer_pose"]
 
@@ -114,20 +114,24 @@ class PoseTransfer:
         """
         own, net = self.identity, self.net
         output, numbers = named(f"{own.name}, {other.name}", lambda: run_network(net, own, other))
-        small = output.vertices
+        small = output.vertices.to(own.verts)  # of weights in another dtype
         if not bool(torch.isfinite(small).all()):
             raise ValueError(f"{other.name}: the network's result is not finite; the weights cannot do this pair")
         if self.refine is not None:
             small = _refined(own.verts, own.simple.faces, small, self.refine)
         posed = own.carry(small)
         usual = net.card.get("usual", {})
-        doubts = (*self._strangers(other), *own.doubts, *other.doubts)
+        doubts = [*self._strangers(other)]
+        doubts += [Doubt(role, text) for role, mesh in (("identity", own), ("pose", other)) for text in mesh.doubts]
+        for field, text in zip(numbers.unusual(usual), numbers.warnings(usual), strict=True):
+            role = field.partition("_")[0]
+            doubts.append(Doubt(role if role in ("identity", "pose") else "", text))
         report = TransferReport(
             own,
             other,
             self.weights,
             numbers,
-            (*doubts, *numbers.warnings(usual)),
+            tuple(doubts),
             bool(usual),
             self.refine,
             time.perf_counter() - start,
@@ -142,17 +146,17 @@ class PoseTransfer:
         )
         return TransferResult(self._placed(posed, other, other.up if up is None else up).cpu(), faces, report, views)
 
-    def _strangers(self, other: Prepared) -> tuple[str, ...]:
+    def _strangers(self, other: Prepared) -> list[Doubt]:
         """Which of the two meshes are not of the weights' kind."""
         found = []
         for role, mesh in (("identity", self.identity), ("pose", other)):
             like = mesh.likeness
             if like is not None and not like.clear:
-                found.append(f"the {role} mesh has {like.doubt}")
+                found.append(Doubt(role, f"the {role} mesh has {like.doubt}"))
             elif like is not None and like.kind != self.kind:
                 shape = f"the {role} mesh has the shape of {like.kind}"
-                found.append(f"these weights are for {self.kind}, but {shape}: use weights of its kind")
-        return tuple(found)
+                found.append(Doubt(role, f"these weights are for {self.kind}, but {shape}: use weights of its kind"))
+        return found
 
     def _frame_in_words(self, other: Prepared, up: Tensor) -> str:
         own = other if self.frame == "pose" else self.identity
@@ -180,7 +184,9 @@ def run_network(net: PretrainedTransfer, identity: Prepared, pose: Prepared) -> 
     pair = identity.verts, pose.verts
     faces = {"identity_faces": identity.simple.faces, "pose_faces": pose.simple.faces}
     one, two = identity.descriptors, pose.descriptors
-    output = net.output(*pair, **faces, identity_descriptors=one, pose_descriptors=two)
+    dtype = next(net.parameters()).dtype
+    first, second = (None if described is None else described.to(dtype) for described in (one, two))
+    output = net.output(*pair, **faces, identity_descriptors=first, pose_descriptors=second)
     numbers = measure_confidence(net, *pair, **faces, output=output, identity_descriptors=one, pose_descriptors=two)
     return output, numbers
 
