@@ -282,7 +282,7 @@ def test_mesh_pairs_against_the_bodies(store, bodies):
             assert (match == -1).all()
         assert batch.identity_mask is None and batch.pose_mask is None
         seen.add((who, first[0], w, how))
-    assert len(seen) > 35 and not {s for s in seen if (s[0], s[3]) == (3, 2)}
+    assert len(seen) > 30 and not {s for s in seen if (s[0], s[3]) == (3, 2)}
 
 
 def test_ragged_batches_are_the_single_ones_padded(store):
@@ -338,6 +338,7 @@ def test_mesh_pairs_without_ground_truth_are_any_two_meshes(store):
 
 
 def test_draws_with_ground_truth_are_even_over_a_complete_grid(store, bodies):
+    """Over the pairs whose identity mesh is not in the pose yet, and whose pose mesh is not the ground truth."""
     some = [k for k in range(len(store)) if int(store.identity[k]) < 3]
     sub = replace_members(store, some)
     pairs = MeshPairs(sub)
@@ -346,7 +347,18 @@ def test_draws_with_ground_truth_are_even_over_a_complete_grid(store, bodies):
         a, b, c = pairs._draw(torch.Generator(), 0, i)
         counts[a, b] += 1
         assert sub.identity[c] == sub.identity[a] and sub.pose[c] == sub.pose[b]
-    assert ((counts - 50).square() / 50).sum() < 145  # the 0.99999 quantile for 80 degrees of freedom is 143
+    allowed = (sub.identity[:, None] != sub.identity) & (sub.pose[:, None] != sub.pose)
+    assert allowed.sum() == 36 and (counts[~allowed] == 0).all()
+    expected = 4050 / 36
+    assert ((counts[allowed] - expected).square() / expected).sum() < 88  # the 0.99999 quantile for 35 degrees is 87
+
+
+def test_a_lone_pose_or_identity_is_its_own_ground_truth(store):
+    """Two identities in one pose: nothing else can be drawn."""
+    alone = [int((store.identity == who).nonzero()[0]) for who in (0, 1)]
+    pairs = MeshPairs(replace_members(store, alone))
+    draws = {pairs._draw(torch.Generator(), 0, i) for i in range(100)}
+    assert draws == {(0, 1, 0), (1, 0, 1)}
 
 
 def replace_members(store: MeshStore, members: list[int]) -> MeshStore:

@@ -25,9 +25,10 @@ class MeshPairs(Dataset[PairBatch]):
     of a batch may differ in vertices and faces; they are padded, with masks, and faces with -1.
 
     With ground truth, the identity mesh is any mesh, the pose one that its identity is stored in, and the pose mesh any
-    mesh in that pose: on a complete grid of identities and poses, that is two independent draws, as in the released
-    loaders. Where files are missing from the grid, only pairs whose ground truth exists are drawn. Without, the two are
-    different meshes of the store.
+    mesh in that pose: on a complete grid of identities and poses, two draws as in the released loaders, but that the
+    pose is not the identity mesh's own, and the pose mesh is not the ground truth, wherever there are others. Where
+    files are missing from the grid, only pairs whose ground truth exists are drawn. Without, the two are different
+    meshes of the store.
 
     Args:
         store: the meshes.
@@ -201,6 +202,8 @@ class _Choice:
         self.of_identity: list[int] = members[by_identity].tolist()
         self.of_pose: list[int] = members[by_pose].tolist()
         self.pose_of: list[int] = pose_row[by_identity].tolist()  # the group of the pose of each entry of of_identity
+        self.in_identity: list[int] = torch.argsort(by_identity).tolist()  # where each member is in of_identity,
+        self.in_pose: list[int] = torch.argsort(by_pose)[by_identity].tolist()  # and each of these in of_pose
 
     def has_pairs(self) -> bool:
         """Whether some pose is shared by two meshes."""
@@ -214,13 +217,23 @@ class _Choice:
         return self.members[a], self.members[min(b + (b >= a), count - 1)]
 
     def with_truth(self, dice: torch.Generator) -> tuple[int, int, int]:
-        """A mesh; a mesh in some pose that the first one's identity takes too; and that identity in that pose."""
+        """A mesh; a mesh in some pose that the first one's identity takes too; and that identity in that pose.
+
+        Wherever there are others, the pose is not the first mesh's, and the second mesh is not the third.
+        """
         u, v, w = torch.rand(3, generator=dice, dtype=torch.float64).tolist()
         a = int(u * len(self.members))
-        start, stop = self.identity_start[self.identity_row[a] : self.identity_row[a] + 2]
-        place = start + int(v * (stop - start))
-        first, last = self.pose_start[self.pose_of[place] : self.pose_of[place] + 2]
-        return self.members[a], self.of_pose[first + int(w * (last - first))], self.of_identity[place]
+        place = _other(v, *self.identity_start[self.identity_row[a] : self.identity_row[a] + 2], self.in_identity[a])
+        second = _other(w, *self.pose_start[self.pose_of[place] : self.pose_of[place] + 2], self.in_pose[place])
+        return self.members[a], self.of_pose[second], self.of_identity[place]
+
+
+def _other(u: float, start: int, stop: int, but: int) -> int:
+    """A place of ``[start, stop)`` for u in [0, 1), another than ``but`` if there is one."""
+    if stop - start == 1:
+        return start
+    place = start + int(u * (stop - start - 1))
+    return place + (place >= but)
 
 
 def _groups(labels: Tensor) -> tuple[Tensor, Tensor]:
