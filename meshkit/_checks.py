@@ -19,7 +19,8 @@ def check_features(x: Any, *, name: str = "x", layout: str = "(B, N, C)") -> Non
         hint = "; convert it with torch.from_numpy" if type(x).__module__ == "numpy" else ""
         raise TypeError(f"{name} must be a tensor {layout}, got {'None' if x is None else type(x).__name__}{hint}")
     if x.dim() != 3:
-        hint = f"; add the batch dimension with {name}[None]" if x.dim() == 2 else ""
+        one = f", or {name}[:, None] if each row is of one sample" if name == "cond" else ""
+        hint = f"; add the batch dimension with {name}[None]{one}" if x.dim() == 2 else ""
         raise ValueError(f"{name} must have shape {layout}, got {tuple(x.shape)}{hint}")
 
 

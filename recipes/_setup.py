@@ -93,6 +93,8 @@ def resumed(cfg: Any, recorded: dict[str, Any], pairs_per_step: int | None = Non
     if ignored and rank() == 0:
         words = ", ".join(f"--{flag.replace('_', '-')} (recorded: {value_of(begun, flag)})" for flag in ignored)
         print(f"warning: --resume goes on with the recorded settings; these do not count: {words}", file=sys.stderr)
+        if "steps" in ignored or "minutes" in ignored:
+            print(f"to train on, begin another run with --init {cfg.out / cfg.name}", file=sys.stderr)
     processes = world_size(cfg.devices)
     if pairs_per_step is None or pairs_per_step == begun.batch * begun.accumulate * processes:
         return begun

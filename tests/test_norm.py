@@ -482,7 +482,9 @@ def test_state_dict_names(kind):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: ElaIN(0, 3), "must be positive, got 0, 3"),
+        (lambda: ElaIN(0, 3), "must be positive whole numbers, got 0, 3"),
+        (lambda: ElaIN(64.0, 3), "must be positive whole numbers, got 64.0, 3"),
+        (lambda: ElaIN(4, 3, eps=-1.0), "cannot be negative, got -1.0"),
         (lambda: ElaIN(3, 3, gate="tanh"), "gate must be \"sigmoid\" or None, got 'tanh'"),
         (lambda: SoftAdaIN(3, 3, gate="tanh"), "gate must be \"sigmoid\" or None, got 'tanh'"),
         (lambda: elain(torch.ones(1, 2, 3), 0, 0, weight=0, variant="x"), 'must be "released" or "paper"'),

@@ -490,6 +490,12 @@ def test_an_unwritable_folder_ends_with_one_line(tmp_path: Path) -> None:
         ("--points", "0"),
         ("--model.descriptors", "hks"),
         ("--accelerator", "abacus"),
+        ("--lr", "-1.0"),
+        ("--lr", "nan"),
+        ("--betas", "1.5 0.9"),
+        ("--adam-eps", "0.0"),
+        ("--warmup", "-2"),
+        ("--lambda-edge", "-1.0"),
     ],
     ids=" ".join,
 )
@@ -497,7 +503,7 @@ def test_impossible_values_are_refused_in_one_line(copied: Path, refuse: Any, mi
     for name in ("state.pt", "config.json"):
         (copied / name).unlink()
     steps = () if mistake[0] in ("--steps", "--minutes") else ("--steps", 1)
-    line = refuse("--out", copied.parent, "--name", copied.name, *steps, *TINY[2:], *mistake)
+    line = refuse("--out", copied.parent, "--name", copied.name, *steps, *TINY[2:], mistake[0], *mistake[1].split())
     assert mistake[1] in line
 
 

@@ -359,6 +359,8 @@ def blob(kind: str) -> Mesh:
 def test_what_is_no_body_is_neither_and_of_no_unit(kind, person):
     mesh = blob(kind)
     assert open_mesh(mesh, "x").likeness.neither
+    why = choose.choose_weights("auto", lambda: open_mesh(mesh, "x")).why
+    assert why.endswith("-humans, those for humans, as the identity's shape is of neither kind")
     net = copier(data="humans", usual=WIDE)
     for role, pair in (("identity", (mesh, person)), ("pose", (person, mesh))):
         report = transfer_pose(*pair, weights=net, **UPRIGHT).report
@@ -423,7 +425,7 @@ def test_doubt_of_size_and_axes_is_a_warning(person, monkeypatch):
     for clear in (False, True):
         monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, c=clear, **__: (torch.eye(3), c))
         report = transfer_pose(person, person, weights=net, identity_up="+z", pose_up="+z").report
-        text = "pose: axes in doubt (up +z, facing -y): give them if they are wrong"
+        text = "pose: axes in doubt (up +z, facing -y): give them, up and facing, if they are wrong"
         assert (text in report.warnings) != clear
         assert ("all within" in str(report)) == clear
 
@@ -482,6 +484,8 @@ def test_unusable_meshes_and_options_are_refused(person, mover, tmp_path, monkey
         PoseTransfer(person, weights=net, refine=math.nan)
     with pytest.raises(ValueError, match="device cuda:99 cannot be used"):
         PoseTransfer(person, weights=net, device="cuda:99")
+    with pytest.raises(ValueError, match=r"identity must be .* got \(ndarray, Tensor\); torch.as_tensor makes"):
+        transfer_pose((person[0].numpy(), person[1]), person, weights=copier())
     with pytest.raises(ValueError, match=r"identity must be a path or a tuple \(verts, faces\)"):
         PoseTransfer(person[0], weights=net)
     with pytest.raises(MeshFileError, match="no such file"):
@@ -647,7 +651,7 @@ def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatc
     monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), next(clear)))
     axes = {name: axis for name, axis in UPRIGHT.items() if name != "pose_facing"}
     results = transfer_sequence(person, [(v, moves[1]) for v in moves[0]], weights=net, **axes)
-    said = "pose 1: axes in doubt (up +z, facing -y): give them if they are wrong"
+    said = "pose 1: axes in doubt (up +z, facing -y): give them, up and facing, if they are wrong"
     reports = [result.report for result in results]
     assert [report.warnings for report in reports] == [(), (said,), ()]
     assert ["in doubt" in report.pose.found for report in reports] == [False, True, False]
@@ -922,7 +926,7 @@ def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, mon
     result = transfer_pose(person, mover, weights=copier(), **UPRIGHT)
     numbers = Confidence(0.9, 0.1, 0.1, None, None, 0.2, 0.3)
     limits = {name: {"median": 0.1, "limit": 0.15} for name in ("match_spread", "mutual_share", "pose_roughness")}
-    doubts = [Doubt("pose", "axes in doubt (up +z, facing -y): give them if they are wrong")]
+    doubts = [Doubt("pose", "axes in doubt (up +z, facing -y): give them, up and facing, if they are wrong")]
     doubts += [Doubt("pose" if "pose mesh's" in text else "", text) for text in numbers.warnings(limits)]
     save_page(tmp_path / "x.html", replace(result, report=replace(result.report, doubts=doubts)))
     assert notes[2] == (

@@ -223,8 +223,10 @@ class _Choice:
         """
         u, v, w = torch.rand(3, generator=dice, dtype=torch.float64).tolist()
         a = int(u * len(self.members))
-        place = _other(v, *self.identity_start[self.identity_row[a] : self.identity_row[a] + 2], self.in_identity[a])
-        second = _other(w, *self.pose_start[self.pose_of[place] : self.pose_of[place] + 2], self.in_pose[place])
+        row = self.identity_row[a]
+        place = _other(v, self.identity_start[row], self.identity_start[row + 1], self.in_identity[a])
+        row = self.pose_of[place]
+        second = _other(w, self.pose_start[row], self.pose_start[row + 1], self.in_pose[place])
         return self.members[a], self.of_pose[second], self.of_identity[place]
 
 

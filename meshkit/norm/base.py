@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from functools import wraps
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -66,8 +67,12 @@ class ConditionalNorm(nn.Module):
 
     def __init__(self, num_features: int, cond_features: int, *, eps: float = 1e-5) -> None:
         super().__init__()
-        if num_features < 1 or cond_features < 1:
-            raise ValueError(f"num_features and cond_features must be positive, got {num_features}, {cond_features}")
+        for width in (num_features, cond_features):
+            if not isinstance(width, Integral) or width < 1:
+                given = f"{num_features!r}, {cond_features!r}"
+                raise ValueError(f"num_features and cond_features must be positive whole numbers, got {given}")
+        if not eps >= 0:
+            raise ValueError(f"eps is added to a variance and cannot be negative, got {eps}")
         self.num_features, self.cond_features, self.eps = num_features, cond_features, eps
 
     def forward(

@@ -81,7 +81,7 @@ class Prepared:
         axes = f"up {axis_name(self.up)}, facing {axis_name(-self.rotation[1])}"
         if self.how == _GIVEN:
             return (*found, f"the axes given ({axes}) seem wrong: leave them out to have them found")
-        return (*found, f"axes in doubt ({axes}): give them if they are wrong")
+        return (*found, f"axes in doubt ({axes}): give them, up and facing, if they are wrong")
 
     def carry(self, deformed: Tensor) -> Tensor:
         """(V, 3) all vertices of the file, from the simple ones (N, 3) deformed; in the frame of the weights."""

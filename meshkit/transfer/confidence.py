@@ -35,7 +35,7 @@ _MEANINGS = (
         True,
         ".1%",
         "the network changes the identity's edges much in length",
-        "look at the result; a smaller weight of refine keeps more of the identity's shape",
+        "look at the result; a smaller weight of the refinement (refine) keeps more of the identity's shape",
     ),
     ("identity_distance", True, ".3f", "the identity mesh's surface is unlike that of the training meshes", _UNLIKE),
     ("pose_distance", True, ".3f", "the pose mesh's surface is unlike that of the training meshes", _UNLIKE),
