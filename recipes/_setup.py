@@ -49,8 +49,8 @@ def check(cfg: Any) -> None:
     if cfg.eval_pairs > 400:
         raise UserError(f"there are 400 test pairs, --eval-pairs asks for {cfg.eval_pairs}")
     for name in ("lr", "adam_eps"):
-        if not 0 < getattr(cfg, name) < math.inf:
-            raise UserError(f"--{name.replace('_', '-')} must be positive, got {getattr(cfg, name)}")
+        if not 0 <= getattr(cfg, name) < math.inf:
+            raise UserError(f"--{name.replace('_', '-')} must not be negative, got {getattr(cfg, name)}")
     if not all(0 <= beta < 1 for beta in cfg.betas):
         raise UserError(f"--betas must lie in [0, 1), got {' '.join(map(str, cfg.betas))}")
     if cfg.warmup < 0:

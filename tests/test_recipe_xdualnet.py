@@ -493,7 +493,7 @@ def test_an_unwritable_folder_ends_with_one_line(tmp_path: Path) -> None:
         ("--lr", "-1.0"),
         ("--lr", "nan"),
         ("--betas", "1.5 0.9"),
-        ("--adam-eps", "0.0"),
+        ("--adam-eps", "-0.1"),
         ("--warmup", "-2"),
         ("--lambda-edge", "-1.0"),
     ],
