@@ -10,6 +10,7 @@ from contextlib import redirect_stderr
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from itertools import takewhile
+from operator import attrgetter
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -38,10 +39,7 @@ def read(kind: type[T], description: str | None, default: T | None = None) -> T:
         raise UserError(f"{mistake(kind, words, said.getvalue())}; --help lists the options") from None
     known = accepted(kind)
     for name in typed(kind, words):
-        value = settings
-        for part in name.split("."):
-            value = getattr(value, part)
-        if value == ():
+        if attrgetter(name)(settings) == ():
             flag = f"--{name}".replace("_", "-")
             raise UserError(f"{flag} takes {meaning(known[name]).rstrip(',')}, got nothing; --help lists the options")
     return settings

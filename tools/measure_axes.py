@@ -17,7 +17,7 @@ from measure_usual import Mesh, mesh_sources
 
 from meshkit.data import load_shipped
 from meshkit.models import load_pretrained, pretrained_names
-from meshkit.transfer._frames import rotations
+from meshkit.transfer._frames import among, rotations
 from meshkit.transfer._open import open_mesh
 from meshkit.transfer._orient import AGREEMENT, RestBody, agreements, choose
 from meshkit.transfer._prepare import prepare
@@ -48,7 +48,7 @@ def main() -> None:
     args = parser.parse_args()
     turns = rotations()
     usual = torch.cat([rotations("+z", "-y"), rotations("+y", "+z")])
-    favoured = (turns[:, None] == usual).all(-1).all(-1).any(1)
+    favoured = among(turns, usual)
     for name in args.names:
         net = load_pretrained(name)
         kind, num_verts = net.card["data"], net.card["vertices"]

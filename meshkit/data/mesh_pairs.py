@@ -213,8 +213,8 @@ class _Choice:
         """Two meshes, different if there are two."""
         u, v, _ = torch.rand(3, generator=dice, dtype=torch.float64).tolist()
         count = len(self.members)
-        a, b = int(u * count), int(v * max(1, count - 1))
-        return self.members[a], self.members[min(b + (b >= a), count - 1)]
+        a = int(u * count)
+        return self.members[a], self.members[_other(v, 0, count, a)]
 
     def with_truth(self, dice: torch.Generator) -> tuple[int, int, int]:
         """A mesh; a mesh in some pose that the first one's identity takes too; and that identity in that pose.

@@ -5,7 +5,7 @@ import itertools
 import torch
 from torch import Tensor
 
-__all__ = ["axis_name", "axis_vector", "rotations", "turn_up", "turns_about"]
+__all__ = ["among", "axis_name", "axis_vector", "rotations", "turn_up", "turns_about"]
 
 
 def axis_vector(axis: str) -> Tensor:
@@ -54,6 +54,11 @@ def turns_about(rotation: Tensor) -> Tensor:
     """A rotation (3, 3) and the six that are a quarter turn away: (7, 3, 3), itself first."""
     quarters = [torch.eye(3), *(turn for turn in rotations() if abs(float(turn.trace()) - 1) < 0.5)]
     return torch.stack(quarters).to(rotation) @ rotation
+
+
+def among(turns: Tensor, others: Tensor) -> Tensor:
+    """Which of the rotations (R, 3, 3) are equal to one of the others (K, 3, 3): (R,) bool."""
+    return (turns[:, None] == others.to(turns)).all(-1).all(-1).any(1)
 
 
 def turn_up(source: Tensor, target: Tensor) -> Tensor:

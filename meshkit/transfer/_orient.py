@@ -11,7 +11,7 @@ from meshkit.models import PoseTransferGenerator, PretrainedTransfer
 from meshkit.models._released_matching import DensePlan
 from meshkit.ot import TransportPlan
 from meshkit.topology import vertex_normals
-from meshkit.transfer._frames import rotations
+from meshkit.transfer._frames import among, rotations
 from meshkit.transfer._kinds import rest_body
 from meshkit.transfer.confidence import row_entropies
 
@@ -109,8 +109,7 @@ def find_rotation(
     """
     rows = agreements(rest, verts, faces, descriptors=descriptors, candidates=candidates)
     usual = torch.cat([rotations("+z", "-y"), rotations("+y", "+z")]) if usual is None else usual
-    favoured = (candidates[:, None] == usual.to(candidates)).all(-1).all(-1).any(1)
-    best, clear = choose(rows, favoured.cpu())
+    best, clear = choose(rows, among(candidates, usual).cpu())
     return candidates[best], clear
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from meshkit.io import MeshFileError, SurfaceBinding
 from meshkit.io._binary_readers import read_scene
 from meshkit.transfer._choose import Weights
-from meshkit.transfer._frames import rotations, turns_about
+from meshkit.transfer._frames import among, rotations, turns_about
 from meshkit.transfer._open import Mesh, examine, named, read
 from meshkit.transfer._orient import find_rotation
 from meshkit.transfer._prepare import Prepared
@@ -234,5 +234,4 @@ class _Follower:
     def _candidates(self, before: Tensor) -> Tensor:
         """The rotation before and those a quarter turn away, without what contradicts the axes that were given."""
         turns = turns_about(before)
-        fits = (turns[:, None] == self._allowed.to(turns)).all(-1).all(-1).any(1)
-        return turns[fits]
+        return turns[among(turns, self._allowed)]
