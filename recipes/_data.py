@@ -215,9 +215,10 @@ def tell_left_out(entries: list[MeshEntry], train: list[MeshEntry], test: list[M
     (people, poses), (unseen_people, unseen_poses) = (
         ({e.identity for e in side}, {e.pose for e in side}) for side in (train, test)
     )
+    taken = {e.path for e in (*train, *test)}
     groups: dict[str, list[str]] = {}
     for e in entries:
-        if e in train or e in test:
+        if e.path in taken:
             continue
         if e.identity in unseen_people and e.pose in poses:
             why = "an identity to test on in a pose to train on"
