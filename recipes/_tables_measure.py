@@ -19,7 +19,7 @@ from _run import UserError
 from deformation_transfer import DeformationTransfer
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
-from tqdm import tqdm
+from tqdm import tqdm, trange
 
 from meshkit.batching import center
 from meshkit.data import MeshPool, PosePairs, load_humans, load_shipped
@@ -135,7 +135,7 @@ def seconds_per_transfer(repeats: int = 3) -> dict[str, Any]:
     times = {}
     for name, call in calls.items():
         measured = []
-        for _ in range(repeats):
+        for _ in trange(repeats, desc=f"time of a transfer, {name}", dynamic_ncols=True):
             start = time.perf_counter()
             call()
             measured.append(time.perf_counter() - start)

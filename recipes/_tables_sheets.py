@@ -11,6 +11,7 @@ from _report import generate
 from _tables_measure import generator_of, pretrained, shipped, test_pairs
 from _tables_train import SYSTEMS, Job
 from torch import Tensor
+from tqdm import tqdm
 
 from meshkit.batching import center
 from meshkit.io import atomic_write, simplify
@@ -71,7 +72,8 @@ def noise_curve(count: int = NOISE_PAIRS) -> dict[str, list[float]]:
         net = pretrained(name)
         curve[name] = []
         for sigma in NOISE:
-            errors = [noisy(net, body, split.test_pairs[i], sigma)[3] for i in range(count)]
+            chosen = tqdm(split.test_pairs[:count], desc=f"{name}, noise {sigma:g} mm", unit="pair", dynamic_ncols=True)
+            errors = [noisy(net, body, pair, sigma)[3] for pair in chosen]
             curve[name].append(sum(errors) / count)
     return curve
 
@@ -96,7 +98,8 @@ def topology_errors(count: int = TOPOLOGY_PAIRS) -> dict[str, Any]:
     for first, one in bodies.items():
         for second, two in bodies.items():
             errors = torch.zeros(len(nets))
-            for a, p, b, q in split.test_pairs[:count, :, None]:
+            title = f"shipped weights, {first} and {second} vertices"
+            for a, p, b, q in tqdm(split.test_pairs[:count, :, None], desc=title, unit="pair", dynamic_ncols=True):
                 identity, pose, truth = one(a, p)[0], two(b, q)[0], center(one(a, q))
                 for j, net in enumerate(nets):
                     output = net(identity, pose, identity_faces=one.faces, pose_faces=two.faces)
@@ -172,6 +175,7 @@ def draw_sheets(
     drawn = []
 
     def sheet(name: str, draw: Callable[..., None], *arguments: Any) -> None:
+        print(f"sheet {name}", flush=True)
         draw(to / f"{name}.png", *arguments)
         drawn.append(name)
 

@@ -32,7 +32,7 @@ from _tables_measure import (
     test_pairs,
     transferred,
 )
-from _tables_sheets import draw_sheets, noise_curve, topology_errors
+from _tables_sheets import WEIGHTS, draw_sheets, noise_curve, topology_errors
 from _tables_train import COMPARED, SYSTEMS, Job, finished, jobs, train_missing
 from _tables_write import Row, write_tables
 
@@ -163,6 +163,19 @@ def tables(cfg: Config, done: list[Job]) -> dict[str, list[Row]]:
     return {name: rows for name, rows in found.items() if rows}
 
 
+def measured_once(cfg: Config) -> dict[str, Any]:
+    """The time of a transfer on this many threads; noise and triangulations, of the weights that are shipped now."""
+    weights = "-".join(fingerprint(name, cfg.out) for name in WEIGHTS)
+    return {
+        name: kept(cfg.out / "figures" / f"{name}-{of}.json", make)
+        for name, of, make in (
+            ("seconds", torch.get_num_threads(), seconds_per_transfer),
+            ("noise", weights, noise_curve),
+            ("topologies", weights, topology_errors),
+        )
+    }
+
+
 def check(cfg: Config) -> None:
     """Refuse values that make no sense before anything is trained."""
     for name in ("pairs", "batch", "seeds", "eval_pairs", "emd_pairs"):
@@ -201,13 +214,7 @@ def main() -> None:
     done = [job for job in wanted if finished(job, cfg)]
     extra: dict[str, Any] = {}
     if cfg.sheets:
-        threads = torch.get_num_threads()
-        for name, make in (
-            (f"seconds-{threads}", seconds_per_transfer),
-            ("noise", noise_curve),
-            ("topologies", topology_errors),
-        ):
-            extra[name.partition("-")[0]] = kept(cfg.out / "figures" / f"{name}.json", make)
+        extra = measured_once(cfg)
     found, drawn = tables(cfg, done), list[str]()
     if cfg.sheets:
         drawn = draw_sheets(to, done, extra["noise"], lambda job: pmd_of(job, cfg), cfg)

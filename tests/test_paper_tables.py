@@ -181,6 +181,18 @@ def test_measurements_are_made_once(
         tables("--emd-pairs", 1)
 
 
+def test_noise_and_triangulations_are_measured_anew_for_other_weights(
+    config: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, made = recipe_module("paper_tables"), []
+    for name in ("seconds_per_transfer", "noise_curve", "topology_errors"):
+        monkeypatch.setattr(recipe, name, lambda name=name: made.append(name) or len(made))
+    first = recipe.measured_once(config)
+    assert first == recipe.measured_once(config) == {"seconds": 1, "noise": 2, "topologies": 3}
+    monkeypatch.setattr(recipe, "fingerprint", lambda name, out: "other")
+    assert recipe.measured_once(config) == {"seconds": 1, "noise": 4, "topologies": 5}
+
+
 def test_a_run_with_another_budget_is_refused(tables: Callable[..., Path], tmp_path: Path) -> None:
     finished_run(tmp_path / "humans-npt-0", 0, pairs=12)
     with pytest.raises(recipe_module("_run").UserError, match=r"humans-npt-0 was begun with the budget .*'pairs': 12"):

@@ -19,7 +19,7 @@ from meshkit.data import load_shipped
 from meshkit.models import load_pretrained, pretrained_names
 from meshkit.transfer._frames import among, rotations
 from meshkit.transfer._open import open_mesh
-from meshkit.transfer._orient import AGREEMENT, RestBody, agreements, choose
+from meshkit.transfer._orient import AGREEMENT, DOUBT, RestBody, agreements, choose
 from meshkit.transfer._prepare import prepare
 
 PEOPLE = 40
@@ -67,7 +67,7 @@ def main() -> None:
             given["wrong, in doubt"] += int((rows[1:, 0] < AGREEMENT).sum())
             for turn in turns:  # a candidate turns the turned mesh as the product of both turns this one
                 order = [int((turns == candidate @ turn).all(-1).all(-1).int().argmax()) for candidate in turns]
-                best, clear = choose(rows[order], favoured)
+                best, clear = choose(rows[order], favoured, doubt=DOUBT[kind])
                 found = "right" if order[best] == 0 else "wrong"
                 count[found] += 1
                 count[f"{found}, in doubt"] += not clear

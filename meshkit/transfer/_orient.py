@@ -17,8 +17,8 @@ from meshkit.transfer.confidence import row_entropies
 
 __all__ = ["RestBody", "agreements", "agrees", "choose", "find_rotation"]
 
-DOUBT = 0.08
-"""Lead in score below which an orientation that was found is in doubt."""
+DOUBT = {"humans": 0.05, "animals": 0.08}
+"""Lead in score below which an orientation that was found is in doubt, for each kind of body."""
 
 AGREEMENT = 0.25
 """Correlation of normals below which an orientation that was given is in doubt."""
@@ -105,20 +105,23 @@ def find_rotation(
             facing -y, and up +y, facing +z.
 
     Returns:
-        The rotation (3, 3), and whether it is clear: its score leads that of the next best by more than 0.08.
+        The rotation (3, 3), and whether it is clear: its score leads that of the next best by more than ``DOUBT``.
     """
     rows = agreements(rest, verts, faces, descriptors=descriptors, candidates=candidates)
     usual = torch.cat([rotations("+z", "-y"), rotations("+y", "+z")]) if usual is None else usual
-    best, clear = choose(rows, among(candidates, usual).cpu())
+    best, clear = choose(rows, among(candidates, usual).cpu(), doubt=DOUBT[rest.kind])
     return candidates[best], clear
 
 
-def choose(rows: Tensor, favoured: Tensor) -> tuple[int, bool]:
-    """Of :func:`agreements` (R, 2) the number of the best, and whether it is clear; ``favoured`` (R,) are the usual."""
+def choose(rows: Tensor, favoured: Tensor, *, doubt: float) -> tuple[int, bool]:
+    """The number of the best of :func:`agreements` (R, 2), and whether it leads by more than ``doubt``.
+
+    ``favoured`` (R,) are the usual ones.
+    """
     score = rows[:, 0] + rows[:, 1] / 8
     best = int((score + _CLEAR * favoured).argmax())
     others = score[torch.arange(len(score)) != best]
-    return best, bool(score[best] - others.max() > DOUBT)
+    return best, bool(score[best] - others.max() > doubt)
 
 
 def agrees(rest: RestBody, verts: Tensor, faces: Tensor, *, descriptors: Tensor | None, rotation: Tensor) -> bool:
