@@ -7,6 +7,7 @@ from meshkit.deform.energy import arap_energy
 from meshkit.deform.factor import ARAPFactor
 from meshkit.deform.moving_least_squares import rigid_moving_least_squares
 from meshkit.deform.options import ARAPInfo
+from meshkit.deform.poisson import poisson_deform
 from meshkit.deform.rest import ARAPRest
 from meshkit.deform.rotation import closest_rotation
 from meshkit.deform.topology import ARAPTopology
@@ -27,5 +28,6 @@ __all__ = [
     "deformation_transfer",
     "key_point_correspondence",
     "mass_matrix",
+    "poisson_deform",
     "rigid_moving_least_squares",
 ]

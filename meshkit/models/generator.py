@@ -11,7 +11,7 @@ from torch.nn.utils.parametrize import is_parametrized
 
 from meshkit._repr import settings
 from meshkit.batching import masked_mean
-from meshkit.deform import rigid_moving_least_squares
+from meshkit.deform import poisson_deform, rigid_moving_least_squares
 from meshkit.models._released_matching import STABILIZER, DensePlan, stabilized_matching
 from meshkit.models.ordered import OrderedPoseTransferStack
 from meshkit.models.output import GeneratorOutput
@@ -59,6 +59,8 @@ class PoseTransferGenerator(nn.Module):
             :func:`~meshkit.deform.rigid_moving_least_squares` of this radius (in the unit of the meshes) before the
             blocks see it. A soft matching averages over all vertices that look alike, most of all those around a limb,
             and shrinks limbs to their axes; the identity mesh's own local form puts the flesh back.
+        poisson_weight: if given, the warped mesh passes through :func:`~meshkit.deform.poisson_deform` of radius
+            ``rigid_radius`` with this weight of the positions instead: the identity's limbs keep their lengths too.
         match_size: scale the pose mesh about the origin to the identity's size before warping it. Sizes are read from
             the last descriptor channel, which must be their logarithm, as
             :func:`~meshkit.descriptors.intrinsic_descriptors` has it. A warp alone gives the identity the limb lengths
@@ -105,6 +107,7 @@ class PoseTransferGenerator(nn.Module):
         residual: bool = False,
         condition: str = "features",
         rigid_radius: float | None = None,
+        poisson_weight: float | None = None,
         match_size: bool = False,
         symmetry: bool = False,
         normalize_plan: bool = True,
@@ -124,7 +127,13 @@ class PoseTransferGenerator(nn.Module):
         if (condition == "descriptors" or match_size) and descriptors == 0:
             raise ValueError('condition="descriptors" and match_size need descriptors: give their number of channels')
         self.eps, self.n_iters, self.normalize_plan = eps, n_iters, normalize_plan
-        self.condition, self.rigid_radius, self.match_size = condition, rigid_radius, match_size
+        if poisson_weight is not None and rigid_radius is None:
+            raise ValueError("poisson_weight needs a rigid_radius")
+        for name, value in (("rigid_radius", rigid_radius), ("poisson_weight", poisson_weight)):
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive or None, got {value}")
+        self.condition, self.match_size = condition, match_size
+        self.rigid_radius, self.poisson_weight = rigid_radius, poisson_weight
         self.symmetry = symmetry
         features = extractor_widths[-1]
         self.extractor: SetConvExtractor | PointwiseExtractor
@@ -159,7 +168,7 @@ class PoseTransferGenerator(nn.Module):
     def extra_repr(self) -> str:
         """Options in the printed module; sizes are those of its parts."""
         matching = settings(self, "eps", "n_iters", "normalize_plan", "released")
-        return f"{matching}, {settings(self, 'condition', 'rigid_radius', 'match_size', 'symmetry')}"
+        return f"{matching}, {settings(self, 'condition', 'rigid_radius', 'poisson_weight', 'match_size', 'symmetry')}"
 
     @torch.no_grad()
     def fit_descriptors(self, descriptors: Tensor) -> None:
@@ -236,6 +245,12 @@ class PoseTransferGenerator(nn.Module):
             labels[-1][real] = mirror_labels(*mesh)
         return torch.where(torch.stack(labels)[..., None], mirrored, features)
 
+    def _flesh_out(self, identity: Tensor, warped: Tensor, mask: Tensor | None, features: Tensor | None) -> Tensor:
+        options: dict[str, Any] = {"radius": self.rigid_radius, "mask": mask, "features": features}
+        if self.poisson_weight is None:
+            return rigid_moving_least_squares(identity, warped, **options)
+        return poisson_deform(identity, warped, weight=self.poisson_weight, **options)
+
     def forward(
         self,
         identity: Tensor,
@@ -281,9 +296,7 @@ class PoseTransferGenerator(nn.Module):
         condition = standard if self.condition == "descriptors" else identity_features
         start = warped.to(identity.dtype)
         if self.rigid_radius is not None:
-            start = rigid_moving_least_squares(
-                identity, start, radius=self.rigid_radius, mask=identity_mask, features=standard
-            )
+            start = self._flesh_out(identity, start, identity_mask, standard)
         vertices = self.transfer(start, condition, mask=identity_mask)
         if identity_mask is not None:
             vertices = vertices.masked_fill(~identity_mask[..., None], 0.0)

@@ -51,6 +51,8 @@ class GeneratorConfig:
     features."""
     rigid_radius: float | None = None
     """Radius of the rigid moving least squares that the warped mesh passes, in the meshes' unit. Paper: none."""
+    poisson_weight: float | None = None
+    """Weight of the positions in the Poisson deformation that it passes instead, of the same radius. Paper: none."""
     match_size: bool = False
     """Scale the pose mesh to the identity's size before warping it, where there are descriptors. Paper: no."""
     symmetry: bool = False
