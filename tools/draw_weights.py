@@ -22,6 +22,8 @@ ROWS = (  # weights, body, rows of the list of test pairs
 )
 
 
+WARPED = (5, 57)  # rows whose warp differs
+WAYS = {"matching's means": (None, None), "rigid MLS": (0.25, None), "Poisson": (0.15, 0.2)}  # radius, weight
 EXCHANGED = (62, 48, 83)  # rows where xdualnet-humans takes one lower leg for the other
 
 
@@ -84,6 +86,26 @@ def draw_exchanged_limbs() -> None:
     sheet.quantize(255).save(IMAGES / "exchanged_limbs.png", optimize=True)
 
 
+@torch.no_grad()
+def draw_warps() -> None:
+    net, (body, split) = load_pretrained("xdualnet-humans"), load_shipped("humans")
+    warped, pictures, captions = [], [], []
+    net.generator.transfer.register_forward_pre_hook(lambda _, inputs: warped.append(inputs[0][0]))
+    for row in WARPED:
+        identity, pose, truth = load_pair(body, split.test_pairs[row])
+        for net.generator.rigid_radius, net.generator.poisson_weight in WAYS.values():
+            net(identity, pose, identity_faces=body.faces, pose_faces=body.faces)
+        meshes, bounds = together([identity, pose, *(w[None] for w in warped), truth])
+        warped.clear()
+        pictures.append([render(v, body.faces, bounds=bounds, size=(240, 240)) for v in meshes])
+        captions.append(["", "", *(score(v, meshes[-1]) for v in meshes[2:-1]), ""])
+    titles = ["identity", "pose", *WAYS, "ground truth"]
+    contact_sheet(pictures, column_titles=titles, captions=captions).quantize(128).save(
+        IMAGES / "warps.png", optimize=True
+    )
+
+
 if __name__ == "__main__":
     draw_weights()
     draw_exchanged_limbs()
+    draw_warps()

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from meshkit.models import load_pretrained, pretrained_names
+from meshkit.models import GeneratorConfig, load_pretrained, pretrained_names
 
 ROOT = Path(__file__).parents[1]
 FACTS = ("command", "sampled", "seed", "steps", "pairs_seen", "train_minutes", "precision", "date", "machine")
@@ -107,6 +107,8 @@ def command(config: dict[str, Any]) -> str:
     words = [f"python recipes/{recipe.__name__}.py --preset {config['preset']} --data {config['data']}"]
     words.append(f"--seed {config['seed']}")
     preset = json.loads(json.dumps(asdict(recipe.PRESETS[config["preset"]]), default=str))
+    # A run that was begun before a setting existed has that setting's default, not what the preset has made of it since.
+    config = config | {"model": asdict(GeneratorConfig()) | config["model"]}
     words += differences(preset, {k: v for k, v in config.items() if k not in IGNORED}, "")
     return " ".join(words)
 

@@ -119,11 +119,12 @@ PRESETS = {
         descriptors="wks",
     ),
 }
-PRESETS["small"] = replace(PRESETS["tiny"], extractor_widths=(32, 64, 64), k=16)
+_POISSON = replace(PRESETS["tiny"], rigid_radius=0.15, poisson_weight=0.2)
+PRESETS["small"] = replace(_POISSON, extractor_widths=(32, 64, 64), k=16)
 _CORENET3D = {
     "paper": GeneratorConfig(extractor="pointwise", extractor_widths=(64, 128, 256)),
     "tiny": replace(PRESETS["tiny"], extractor="pointwise", extractor_widths=(16, 32, 64), extractor_blocks=2),
-    "small": replace(PRESETS["tiny"], extractor="pointwise", extractor_widths=(32, 64, 128)),
+    "small": replace(_POISSON, extractor="pointwise", extractor_widths=(32, 64, 128)),
 }
 _NPT = {"paper": (64, 128, 1024), "tiny": (32, 64, 253), "small": (32, 64, 253)}
 
