@@ -7,6 +7,7 @@ import math
 import sys
 from dataclasses import asdict, replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 from _command_line import typed
@@ -15,6 +16,7 @@ from _run import UserError
 from torch import nn
 
 from meshkit.models import GeneratorConfig, load_generator, load_pretrained, pretrained_names
+from meshkit.models.pretrained import instead_of
 
 
 def check(cfg: Any) -> None:
@@ -113,16 +115,17 @@ SHAPING |= {"condition", "descriptors", "num_signatures", "released"}
 
 def initialize(generator: nn.Module, cfg: Any) -> None:
     """Give ``generator`` the weights called ``cfg.init``, with their statistics of descriptors."""
-    names = pretrained_names()
     try:
-        if cfg.init in names:
+        if cfg.init in pretrained_names():
             loaded = load_pretrained(cfg.init)
             known, model = loaded.generator, loaded.config
         else:
             known, model = load_generator(cfg.init)
     except ValueError as error:
-        advice = f"give one of {', '.join(names)}, or the folder of a run"
-        raise UserError(f"--init {cfg.init}: {str(error).splitlines()[0]}; {advice}") from None
+        if not Path(cfg.init).exists():
+            instead = f"{instead_of(Path(cfg.init).name)}; or give the folder of a run"
+            raise UserError(f"--init {cfg.init}: neither shipped weights nor a folder are named so{instead}") from None
+        raise UserError(f"--init {cfg.init}: {str(error).splitlines()[0]}") from None
     others = differences(model, cfg.model)
     try:
         generator.load_state_dict(known.state_dict())

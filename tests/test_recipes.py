@@ -454,7 +454,9 @@ def test_init_begins_with_the_weights_of_a_run(run: Callable[..., Path], without
             "spectral True (here False); leave out --model.spectral",
         ),
         ("npt", "corenet3d-humans", (), "architecture matching (here npt_maxpool); give weights of the same network"),
-        ("xdualnet", "nobody", (), "nobody holds no model.json: give the folder of a finished or checkpointed run"),
+        ("xdualnet", "nobody", (), "--init nobody: neither shipped weights nor a folder are named so; there are coren"),
+        ("xdualnet", "corenet-human", (), "named so: did you mean corenet3d-humans? There are corenet3d-humans, xdual"),
+        ("xdualnet", str(Path(__file__).parent), (), "holds no model.json: give the folder of a finished or checkp"),
     ],
 )
 def test_weights_of_another_network_say_what_to_type(run: Any, recipe: str, init: str, flags: Any, said: str) -> None:
