@@ -167,14 +167,17 @@ def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, Mesh
     stores = []
     for side, chosen in (("train", train), ("test", test)):
         if len(chosen) < 2:
-            raise UserError(f"--data {cfg.data}: {len(chosen)} meshes to {side} on are too few, of {len(entries)}")
+            raise UserError(
+                f"--data {cfg.data}: {len(chosen)} meshes to {side} on are too few, of {len(entries)}: two identities "
+                "and two poses or more are set apart to test on, and two other meshes are needed to train on"
+            )
         # Every process reads the cache; who comes first has made it.
         where = run.path(f"cache_{side}")
         try:
             with plain_warnings():
                 stores.append(MeshStore.build(chosen, where, skip_bad=cfg.skip_bad, progress=run.writes))
         except MeshFileError as error:
-            advice = "" if cfg.skip_bad else "; mend or remove the file, or leave out such files with --skip-bad"
+            advice = "" if cfg.skip_bad else "; remove the file, or leave out such files with --skip-bad"
             raise UserError(f"--data {cfg.data}: {error}{advice}") from None
         if len(stores[-1]) < 2:
             raise UserError(f"--data {cfg.data}: {len(stores[-1])} readable meshes to {side} on are too few")

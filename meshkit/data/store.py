@@ -166,7 +166,8 @@ class MeshStore:
         with atomic_write(cache / "index.json") as temporary:
             temporary.write_text(json.dumps(index))
         if skipped:
-            message = f"{len(skipped)} of {len(entries)} mesh files were left out, the first: {skipped[0][1]}"
+            were = "was" if len(skipped) == 1 else "were"
+            message = f"{len(skipped)} of {len(entries)} mesh files {were} left out, the first: {skipped[0][1]}"
             warnings.warn(message, stacklevel=2)
         return cls(cache)
 

@@ -70,7 +70,7 @@ def load_mesh(path: str | os.PathLike[str], *, max_bytes: int = 2**28) -> tuple[
     extension = _extension(path, "read")
     try:
         if not path.is_file():
-            raise MeshFileError(f"{path}: {'a folder, not a mesh file' if path.is_dir() else 'no such file'}")
+            raise MeshFileError(f"{path}: no such file")
         if (size := path.stat().st_size) > max_bytes:
             raise MeshFileError(
                 f"{path}: {size:,} bytes, more than max_bytes={max_bytes:,}; raise it to read this file"
@@ -136,6 +136,8 @@ def save_mesh(path: str | os.PathLike[str], verts: Tensor, faces: Tensor) -> Non
 
 def _extension(path: Path, verb: str) -> str:
     extension = path.suffix.lower()
+    if path.is_dir():
+        raise MeshFileError(f"{path}: a folder, not a mesh file")
     if extension not in _READERS:
         raise MeshFileError(f"{path}: extension {path.suffix!r} cannot be {verb}; use one of {', '.join(_READERS)}")
     return extension
