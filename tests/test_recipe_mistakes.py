@@ -13,6 +13,7 @@ import torch
 from recipe_runs import launch, recipe_module
 
 from meshkit.data import MeshEntry
+from meshkit.io import MeshFileError
 
 pytest.importorskip("tyro")
 
@@ -107,6 +108,19 @@ def test_a_rig_with_too_little_to_make_more_of(monkeypatch: pytest.MonkeyPatch) 
     body.identities = None
     with pytest.raises(recipe_module("_run").UserError, match="this rig has no identities to make others of"):
         data.with_sampled_identities(body, split, 5, seed=0)
+
+
+def test_a_file_that_changed_under_a_run_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """A worker's error comes with the traceback of its process in the message."""
+
+    def fail() -> None:
+        raise MeshFileError(
+            "Caught it in worker 0.\nTraceback:\nmeshkit.io.files.MeshFileError: a.npy: shard is damaged"
+        )
+
+    with pytest.raises(SystemExit, match="2"):
+        recipe_module("_run").guard(fail)
+    assert capsys.readouterr().err == "error: a.npy: shard is damaged\n"
 
 
 def test_it_ends_with_status_2_and_help_with_0() -> None:
