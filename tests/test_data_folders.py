@@ -258,12 +258,19 @@ def test_damaged_stores_say_so_and_are_built_again(tmp_path):
         shard.write_bytes(whole)
 
 
-def test_what_is_no_folder_or_no_list_is_said(tmp_path):
+def test_what_is_no_folder_or_no_list_is_said(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(MeshFileError, match="file: a file, not a folder"):
         scan_pose_transfer(tmp_path / "file")
     with pytest.raises(MeshFileError, match="a folder, not a list"):
         read_test_list(tmp_path, [])
+
+    def refuse(folder):
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr("os.listdir", refuse)
+    with pytest.raises(MeshFileError, match=r"it cannot be listed \(Permission denied\)"):
+        scan_pose_transfer(tmp_path)
 
 
 # Pairs

@@ -173,6 +173,10 @@ def _scan(
     folder = Path(folder)
     if not folder.is_dir():
         raise MeshFileError(f"{folder}: {'a file, not a folder' if folder.exists() else 'no such folder'}")
+    try:  # glob finds nothing where it may not look
+        os.listdir(folder)
+    except OSError as error:
+        raise MeshFileError(f"{folder}: it cannot be listed ({error.strerror or error})") from error
     found = {path: place for path in sorted(folder.glob(pattern)) if (place := numbers(path)) is not None}
     if not found:
         raise MeshFileError(f"{folder}: no mesh named like {example} in it")

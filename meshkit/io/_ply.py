@@ -6,57 +6,30 @@ What the header claims is held against the bytes that are there before any of th
 import struct
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import numpy as np
 
 from meshkit.io._lines import (
     COPY_AGAIN,
-    EMPTY,
-    TOO_EARLY,
     Growing,
     add_faces,
     add_verts,
-    blame,
     corners_of,
     read_rows,
-    shown,
 )
 from meshkit.io._mesh import Parsed
+from meshkit.io._ply_header import Element, read_header
 from meshkit.io.report import counted
 
-_TYPES = {
-    **{b"char": "i1", b"uchar": "u1", b"short": "i2", b"ushort": "u2", b"int": "i4", b"uint": "u4"},
-    **{b"int8": "i1", b"uint8": "u1", b"int16": "i2", b"uint16": "u2", b"int32": "i4", b"uint32": "u4"},
-    **{b"float": "f4", b"double": "f8", b"float32": "f4", b"float64": "f8"},
-}
-_ORDERS = {b"ascii": "", b"binary_little_endian": "<", b"binary_big_endian": ">"}
 _CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}  # of struct
 _CORNERS = ("vertex_indices", "vertex_index")
-_LONGEST = 2**16  # bytes of a line of the header
-_MOST_LINES = 10_000
-
-
-class _Property(NamedTuple):
-    name: str
-    kind: str
-    size: str = ""  # type of the number of entries of a list
-
-
-class _Element(NamedTuple):
-    name: str
-    rows: int
-    properties: list[_Property]
-
-    @property
-    def lists(self) -> bool:
-        return any(p.size for p in self.properties)
 
 
 def read_ply(path: Path, _limit: int) -> Parsed:
     """Vertices and faces of a PLY file; all else in it is passed over."""
     with path.open("rb") as stream:
-        order, elements, number = _header(stream)
+        order, elements, number = read_header(stream)
         by_name = {element.name: element for element in elements}
         if len(by_name) < len(elements):
             raise ValueError("its header names an element twice")
@@ -74,49 +47,7 @@ def read_ply(path: Path, _limit: int) -> Parsed:
     return mesh.parsed()
 
 
-def _header(stream: BinaryIO) -> tuple[str, list[_Element], int]:
-    """Byte order (empty for text), elements, and the number of lines."""
-    first = stream.readline(_LONGEST)
-    if not first:
-        raise ValueError(EMPTY)
-    if first.strip() != b"ply":
-        raise ValueError(f"the first line is {shown(first)}, not ply")
-    order: str | None = None
-    elements: list[_Element] = []
-    for number in range(2, _MOST_LINES):
-        line = stream.readline(_LONGEST)
-        if not line.endswith(b"\n"):
-            raise ValueError(f"{TOO_EARLY}: there is no end_header")
-        match line.split():
-            case [b"end_header"]:
-                if order is None:
-                    raise ValueError("its header has no line of the format")
-                return order, elements, number
-            case [b"format", kind, b"1.0"] if kind in _ORDERS and order is None:
-                order = _ORDERS[kind]
-            case [b"element", name, count] if count.isdigit():
-                elements.append(_Element(name.decode(errors="replace"), int(count), []))
-            case [b"property", b"list", size, kind, name] if elements and _TYPES.get(size, "f")[0] in "iu":
-                _add(elements[-1], number, line, name, kind, _TYPES[size])
-            case [b"property", kind, name] if elements:
-                _add(elements[-1], number, line, name, kind)
-            case [b"comment" | b"obj_info", *_] | []:
-                pass
-            case _:
-                raise blame(number, line, "no line of the header of a PLY file")
-    raise ValueError(f"there is no end_header in its first {_MOST_LINES:,} lines")
-
-
-def _add(element: _Element, number: int, line: bytes, name: bytes, kind: bytes, size: str = "") -> None:
-    text = name.decode(errors="replace")
-    if kind not in _TYPES:
-        raise blame(number, line, f"{shown(kind)} is no type of a PLY file")
-    if any(p.name == text for p in element.properties):
-        raise blame(number, line, f"{element.name} has two properties of this name")
-    element.properties.append(_Property(text, _TYPES[kind], size))
-
-
-def _columns(vertex: _Element | None) -> tuple[int, ...]:
+def _columns(vertex: Element | None) -> tuple[int, ...]:
     if vertex is None:
         raise ValueError("its header has no element vertex")
     names = [p.name for p in vertex.properties]
@@ -128,7 +59,7 @@ def _columns(vertex: _Element | None) -> tuple[int, ...]:
     return tuple(names.index(axis) for axis in "xyz")
 
 
-def _text(stream: BinaryIO, elements: list[_Element], mesh: Growing, columns: tuple[int, ...], number: int) -> None:
+def _text(stream: BinaryIO, elements: list[Element], mesh: Growing, columns: tuple[int, ...], number: int) -> None:
     lines = ((n, content) for n, line in enumerate(stream, number + 1) if (content := line.strip()))
     for element in elements:
         if element.name == "vertex":
@@ -141,7 +72,7 @@ def _text(stream: BinaryIO, elements: list[_Element], mesh: Growing, columns: tu
             read_rows(lines, element.rows, f"rows of {element.name}", lambda rows, ends: None)
 
 
-def _corners_after(element: _Element, row: bytes) -> list[int]:
+def _corners_after(element: Element, row: bytes) -> list[int]:
     """Corners of a face that has other properties before them."""
     fields = row.split()
     at = 0
@@ -152,7 +83,7 @@ def _corners_after(element: _Element, row: bytes) -> list[int]:
     return corners_of(b" ".join(fields[at:]))
 
 
-def _binary(stream: BinaryIO, order: str, elements: list[_Element], mesh: Growing) -> None:
+def _binary(stream: BinaryIO, order: str, elements: list[Element], mesh: Growing) -> None:
     at = 0
     start = stream.tell()
     data = stream.read()
@@ -178,7 +109,7 @@ def _binary(stream: BinaryIO, order: str, elements: list[_Element], mesh: Growin
                 mesh.add_mixed(polygons)
 
 
-def _alike(element: _Element, order: str, data: bytes, at: int) -> np.ndarray | None:
+def _alike(element: Element, order: str, data: bytes, at: int) -> np.ndarray | None:
     """Rows whose lists are as long as those of the first, as a structured array; ``None`` if they are not alike."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     place, sizes = at, {}
@@ -200,7 +131,7 @@ def _alike(element: _Element, order: str, data: bytes, at: int) -> np.ndarray | 
     return rows if all((rows[name] == size).all() for name, size in sizes.items()) else None
 
 
-def _walk(element: _Element, order: str, data: bytes, at: int, start: int) -> tuple[list[tuple[int, ...]], int]:
+def _walk(element: Element, order: str, data: bytes, at: int, start: int) -> tuple[list[tuple[int, ...]], int]:
     """Corners of rows of different lengths, and where they end."""
     polygons: list[tuple[int, ...]] = []
     for row in range(element.rows if element.properties else 0):

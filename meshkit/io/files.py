@@ -67,8 +67,8 @@ def load_mesh(path: str | os.PathLike[str], *, max_bytes: int = 2**28) -> tuple[
         (torch.Size([4, 3]), [[0, 1, 2], [0, 2, 3]])
     """
     path = Path(path)
-    extension = _extension(path, "read")
     try:
+        extension = _extension(path, "read")
         if not path.is_file():
             raise MeshFileError(f"{path}: no such file")
         if (size := path.stat().st_size) > max_bytes:
@@ -81,7 +81,7 @@ def load_mesh(path: str | os.PathLike[str], *, max_bytes: int = 2**28) -> tuple[
     except OSError as error:
         raise MeshFileError(f"{path}: it cannot be read ({error.strerror or error})") from error
     except Exception as error:
-        raise MeshFileError(f"{path}: not a readable {extension[1:].upper()} mesh ({error})") from error
+        raise MeshFileError(f"{path}: not a readable {path.suffix[1:].upper()} mesh ({error})") from error
     with np.errstate(over="ignore"):  # what overflows becomes infinite, and is reported as such
         points = verts.astype(np.float32)
     _check(points, faces, path)
