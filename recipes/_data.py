@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -62,12 +62,12 @@ def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -
                 raise UserError(f"--sampled-{flag} needs a rig, whose {flag} have coefficients: drop it")
             return files(cfg, run, SCANNERS[kind](place))
         body, split = rigged(kind, Path(place)) if place else load_shipped(kind, cfg.vertices)
+        if cfg.sampled_identities:
+            body, split = with_sampled_identities(body, split, cfg.sampled_identities, cfg.seed)
+        if cfg.sampled_poses:
+            body, split = with_sampled_poses(body, split, cfg.sampled_poses, cfg.seed)
     except ValueError as error:
         raise UserError(f"--data {cfg.data}: {error}") from None
-    if cfg.sampled_identities:
-        body, split = with_sampled_identities(body, split, cfg.sampled_identities, cfg.seed)
-    if cfg.sampled_poses:
-        body, split = with_sampled_poses(body, split, cfg.sampled_poses, cfg.seed)
     train, test = posed(cfg, run, workers, body, split)
     return train.to(device), test.to(device)
 
@@ -118,27 +118,29 @@ def rigged(kind: str, file: Path) -> tuple[RiggedModel, Split]:
 
 def with_sampled_identities(body: RiggedModel, split: Split, count: int, seed: int) -> tuple[RiggedModel, Split]:
     """A body and split with ``count`` more training identities, like the known training ones."""
-    if body.identities is None:
-        raise UserError("this rig has no identities to draw others from")
-    draw = torch.Generator().manual_seed(seed)
-    known = body.identities
-    new = sample_identities(known[split.train_identities], count, spread=0.7, generator=draw)
-    body.identities = torch.cat([known, new])
-    body.identity_names = ()
-    train = torch.cat([split.train_identities, len(known) + torch.arange(count)])
-    return body, replace(split, train_identities=train)
+    return with_more(
+        body, split, "identity", seed, lambda known, draw: sample_identities(known, count, spread=0.7, generator=draw)
+    )
 
 
 def with_sampled_poses(body: RiggedModel, split: Split, count: int, seed: int) -> tuple[RiggedModel, Split]:
     """A body and split with ``count`` more training poses, put together from the known training ones."""
-    if body.poses is None:
-        raise UserError("this rig has no poses to put others together from")
-    draw = torch.Generator().manual_seed(seed)
-    known = body.poses
-    new = sample_poses(known[split.train_poses], body.parents, count, generator=draw)
-    body.poses = torch.cat([known, new])
-    body.pose_names = ()
-    return body, replace(split, train_poses=torch.cat([split.train_poses, len(known) + torch.arange(count)]))
+    parents = body.parents
+    return with_more(body, split, "pose", seed, lambda known, draw: sample_poses(known, parents, count, generator=draw))
+
+
+def with_more(
+    body: RiggedModel, split: Split, what: str, seed: int, make: Callable[[Tensor, torch.Generator], Tensor]
+) -> tuple[RiggedModel, Split]:
+    """A body with more identities or poses, made of the known training ones, and a split that trains on them too."""
+    table = {"identity": "identities", "pose": "poses"}[what]
+    known, rows = getattr(body, table), getattr(split, f"train_{table}")
+    if known is None:
+        raise UserError(f"this rig has no {table} to make others of")
+    new = make(known[rows], torch.Generator().manual_seed(seed))
+    setattr(body, table, torch.cat([known, new]))
+    setattr(body, f"{what}_names", ())
+    return body, replace(split, **{f"train_{table}": torch.cat([rows, len(known) + torch.arange(len(new))])})
 
 
 def drawn_split(identities: int, poses: int, draw: torch.Generator) -> Split:
@@ -165,14 +167,17 @@ def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, Mesh
     stores = []
     for side, chosen in (("train", train), ("test", test)):
         if len(chosen) < 2:
-            raise UserError(f"--data {cfg.data}: {len(chosen)} meshes to {side} on are too few, of {len(entries)}")
+            raise UserError(
+                f"--data {cfg.data}: {len(chosen)} meshes to {side} on are too few, of {len(entries)}: two identities "
+                "and two poses or more are set apart to test on, and two other meshes are needed to train on"
+            )
         # Every process reads the cache; who comes first has made it.
         where = run.path(f"cache_{side}")
         try:
             with plain_warnings():
                 stores.append(MeshStore.build(chosen, where, skip_bad=cfg.skip_bad, progress=run.writes))
         except MeshFileError as error:
-            advice = "" if cfg.skip_bad else "; mend or remove the file, or leave out such files with --skip-bad"
+            advice = "" if cfg.skip_bad else "; remove the file, or leave out such files with --skip-bad"
             raise UserError(f"--data {cfg.data}: {error}{advice}") from None
         if len(stores[-1]) < 2:
             raise UserError(f"--data {cfg.data}: {len(stores[-1])} readable meshes to {side} on are too few")

@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from meshkit.io import atomic_write
+from meshkit.io import MeshFileError, atomic_write
 
 
 class UserError(Exception):
@@ -34,6 +34,10 @@ def guard(main: Any, *arguments: Any, advice: str = RESUME) -> None:
         main(*arguments)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except MeshFileError as error:  # of a file that changed under the run
+        said = str(error).strip().splitlines()[-1]  # a worker's error comes with its traceback
+        print(f"error: {said.removeprefix('meshkit.io.files.MeshFileError: ')}", file=sys.stderr)
         raise SystemExit(2) from None
     except OSError as error:
         print(f"error: {error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)

@@ -7,6 +7,7 @@ import math
 import sys
 from dataclasses import asdict, replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 from _command_line import typed
@@ -15,6 +16,7 @@ from _run import UserError
 from torch import nn
 
 from meshkit.models import GeneratorConfig, load_generator, load_pretrained, pretrained_names
+from meshkit.models.pretrained import instead_of
 
 
 def check(cfg: Any) -> None:
@@ -36,11 +38,14 @@ def check(cfg: Any) -> None:
         value = getattr(cfg, name, None)
         if value is not None and value < 1:
             raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
-    for what in ("identities", "poses"):
-        count = getattr(cfg, f"sampled_{what}", 0)
-        if count < 0:
-            raise UserError(f"--sampled-{what} must not be negative, got {count}")
-    if cfg.steps is None and (cfg.minutes is None or cfg.minutes <= 0):
+    for name in ("sampled_identities", "sampled_poses", "workers", "threads", "warmup"):
+        if getattr(cfg, name, 0) < 0:
+            raise UserError(f"--{name.replace('_', '-')} must not be negative, got {getattr(cfg, name)}")
+    if not cfg.name.strip():
+        raise UserError("--name must not be empty: it is the run's folder below --out")
+    if not 0 <= cfg.seed < 2**63:
+        raise UserError(f"--seed must lie between 0 and 2^63 - 1, got {cfg.seed}")
+    if cfg.steps is None and (cfg.minutes is None or not 0 < cfg.minutes < math.inf):
         raise UserError(f"give --steps, or positive --minutes, got {cfg.minutes}")
     together, processes = cfg.batch * cfg.accumulate * world_size(cfg.devices), world_size(cfg.devices)
     if together > cfg.pairs:
@@ -50,11 +55,9 @@ def check(cfg: Any) -> None:
         raise UserError(f"there are 400 test pairs, --eval-pairs asks for {cfg.eval_pairs}")
     for name in ("lr", "adam_eps"):
         if not 0 <= getattr(cfg, name) < math.inf:
-            raise UserError(f"--{name.replace('_', '-')} must not be negative, got {getattr(cfg, name)}")
+            raise UserError(f"--{name.replace('_', '-')} must be a number of at least 0, got {getattr(cfg, name)}")
     if not all(0 <= beta < 1 for beta in cfg.betas):
         raise UserError(f"--betas must lie in [0, 1), got {' '.join(map(str, cfg.betas))}")
-    if cfg.warmup < 0:
-        raise UserError(f"--warmup must not be negative, got {cfg.warmup}")
     for name in (n for n in vars(cfg) if n.startswith("lambda_")):
         if not 0 <= getattr(cfg, name) < math.inf:
             raise UserError(f"--{name.replace('_', '-')} must be a weight of at least 0, got {getattr(cfg, name)}")
@@ -113,16 +116,17 @@ SHAPING |= {"condition", "descriptors", "num_signatures", "released"}
 
 def initialize(generator: nn.Module, cfg: Any) -> None:
     """Give ``generator`` the weights called ``cfg.init``, with their statistics of descriptors."""
-    names = pretrained_names()
     try:
-        if cfg.init in names:
+        if cfg.init in pretrained_names():
             loaded = load_pretrained(cfg.init)
             known, model = loaded.generator, loaded.config
         else:
             known, model = load_generator(cfg.init)
     except ValueError as error:
-        advice = f"give one of {', '.join(names)}, or the folder of a run"
-        raise UserError(f"--init {cfg.init}: {str(error).splitlines()[0]}; {advice}") from None
+        if not Path(cfg.init).exists():
+            instead = f"{instead_of(Path(cfg.init).name)}; or give the folder of a run"
+            raise UserError(f"--init {cfg.init}: neither shipped weights nor a folder are named so{instead}") from None
+        raise UserError(f"--init {cfg.init}: {str(error).splitlines()[0]}") from None
     others = differences(model, cfg.model)
     try:
         generator.load_state_dict(known.state_dict())

@@ -83,6 +83,8 @@ class DeformationTransfer(nn.Module):
 def main() -> None:
     """Transfer all test pairs, and report."""
     cfg = read(Config, __doc__)
+    if cfg.threads < 0:
+        raise UserError(f"--threads must not be negative, got {cfg.threads}")
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
     if not 1 <= cfg.eval_pairs <= 400:

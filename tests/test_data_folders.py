@@ -243,6 +243,34 @@ def test_damaged_stores_say_so_and_are_built_again(tmp_path):
         with pytest.raises(MeshFileError, match="cache: no store of meshes in it"):
             MeshStore(cache)
         assert len(MeshStore.build(entries, cache, progress=False)) == 2
+    for kind in ("verts", "faces"):
+        shard = cache / f"{kind}-00000.npy"
+        whole = shard.read_bytes()
+        shard.write_bytes(whole[:70])
+        with pytest.raises(MeshFileError, match=rf"{kind}-00000.npy: shard is cut short; delete .*cache and build"):
+            MeshStore(cache)
+        assert len(MeshStore.build(entries, cache, progress=False)) == 2
+        assert shard.read_bytes() == whole
+        for garbage, said in ((b"garbage" * 100, r"\("), (whole.replace(b"4'", b"8'"), r"\(.*rows of 3")):
+            shard.write_bytes(garbage + bytes(1000))
+            with pytest.raises(MeshFileError, match=f"{kind}-00000.npy: shard is damaged {said}"):
+                getattr(MeshStore(cache), kind)(0)
+        shard.write_bytes(whole)
+
+
+def test_what_is_no_folder_or_no_list_is_said(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MeshFileError, match="file: a file, not a folder"):
+        scan_pose_transfer(tmp_path / "file")
+    with pytest.raises(MeshFileError, match="a folder, not a list"):
+        read_test_list(tmp_path, [])
+
+    def refuse(folder):
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr("os.listdir", refuse)
+    with pytest.raises(MeshFileError, match=r"it cannot be listed \(Permission denied\)"):
+        scan_pose_transfer(tmp_path)
 
 
 # Pairs

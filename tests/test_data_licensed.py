@@ -372,6 +372,17 @@ def test_files_that_are_no_models_are_named(tmp_path, chumpy):
             load_smpl(tmp_path / name, max_bytes=1000)
 
 
+def test_a_model_that_may_not_be_read_is_named(tmp_path, monkeypatch):
+    (tmp_path / "body.pkl").write_bytes(b"x")
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("pathlib.Path.open", refuse)
+    with pytest.raises(MeshFileError, match=r"body\.pkl: it cannot be read \(Permission denied\)"):
+        load_smpl(tmp_path / "body.pkl")
+
+
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [

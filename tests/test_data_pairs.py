@@ -475,3 +475,11 @@ def test_listed_pairs_are_the_rows_of_the_list_with_and_without_a_pool() -> None
 def _template_order(batch: PairBatch, truth: torch.Tensor) -> torch.Tensor:
     """Template vertex of each row of the ground truth, found by position."""
     return torch.cdist(batch.ground_truth, truth, compute_mode="donot_use_mm_for_euclid_dist").argmin(2)
+
+
+def test_tables_are_indexed_by_whole_numbers(humans):
+    rows = torch.tensor([1, 2])
+    with pytest.raises(ValueError, match=r"identities must be whole numbers, rows of .* got torch\.float32"):
+        PosePairs(humans, rows.float(), rows)
+    with pytest.raises(ValueError, match=r"listed must be a pair or more \(L, 4\), got \(0, 4\)"):
+        PosePairs(humans, rows, rows, listed=torch.zeros(0, 4, dtype=torch.long))

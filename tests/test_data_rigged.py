@@ -253,3 +253,20 @@ def test_sampled_poses_need_poses_of_the_joints():
 def test_sampling_needs_two_identities():
     with pytest.raises(ValueError, match=r"at least two rows.*\(1, 3\)"):
         sample_identities(torch.randn(1, 3), 4)
+
+
+@pytest.mark.parametrize(
+    ("count", "spread", "message"),
+    [
+        (-1, 1.0, "count and spread must not be negative, got -1 and 1.0"),
+        (2, -0.5, "got 2 and -0.5"),
+        (2, float("nan"), "got 2 and nan"),
+    ],
+)
+def test_samples_of_no_number_are_refused(count, spread, message):
+    with pytest.raises(ValueError, match=message):
+        sample_identities(torch.randn(4, 3), count, spread=spread)
+    with pytest.raises(ValueError, match="NaN or infinite"):
+        sample_identities(torch.full((4, 3), torch.nan), 2)
+    with pytest.raises(ValueError, match="count must not be negative, got -1"):
+        sample_poses(torch.zeros(2, 3, 3), torch.tensor([-1, 0, 1]), -1)

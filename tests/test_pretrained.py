@@ -202,7 +202,7 @@ def test_recipes_are_told_apart_by_their_settings(exporter, recipe):
     assert run_history.command(config).startswith(f"python recipes/{recipe}.py --preset tiny --data humans --seed 0")
 
 
-def test_a_run_that_began_with_others_has_their_commands(exporter, finished_run, tmp_path):
+def test_a_run_that_began_with_others_has_their_commands(exporter, finished_run, tmp_path, monkeypatch):
     from run_history import runs
 
     def begun(name, **changes):
@@ -215,6 +215,7 @@ def test_a_run_that_began_with_others_has_their_commands(exporter, finished_run,
         return folder
 
     shipped = json.loads((ROOT / "meshkit" / "weights" / "xdualnet-humans.json").read_text())
+    monkeypatch.setattr("safetensors.torch.load", lambda _: pytest.fail("a card needs no weights"))
     first = begun("first", init="xdualnet-humans", seed=1)
     second = begun("second", init=str(first), seed=2, sampled_poses=30)
     found = runs(second, "new")
@@ -277,6 +278,24 @@ def test_rounding_that_moves_vertices_is_refused(exporter, finished_run, tmp_pat
 def test_unknown_names_list_the_known():
     with pytest.raises(ValueError, match="no weights are named 'smpl'; there are"):
         load_pretrained("smpl")
+
+
+def test_a_mistyped_name_finds_the_one_that_was_meant():
+    for wrong, name in (
+        ("corenet-human", "corenet3d-humans"),
+        ("XDualNet_Humans", "xdualnet-humans"),
+        ("xdualnet-animal", "xdualnet-animals"),
+    ):
+        with pytest.raises(ValueError, match=rf"named '{wrong}': did you mean {name}\? There are corenet3d-humans, "):
+            load_pretrained(wrong)
+
+
+def test_a_card_is_read_without_the_weights(monkeypatch):
+    monkeypatch.setattr("safetensors.torch.load", lambda _: pytest.fail("the weights were loaded"))
+    name = pretrained_names()[0]
+    assert pretrained.read_card(name)["name"] == name
+    with pytest.raises(ValueError, match="no weights are named 'smpl'; there are"):
+        pretrained.read_card("smpl")
 
 
 def test_no_folder_is_no_weights(tmp_path, monkeypatch):

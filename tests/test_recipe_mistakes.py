@@ -1,7 +1,9 @@
 """What recipes say of a mistyped command line, of meshes that a split leaves out, and in which unit they report."""
 
+import importlib
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +13,7 @@ import torch
 from recipe_runs import launch, recipe_module
 
 from meshkit.data import MeshEntry
+from meshkit.io import MeshFileError
 
 pytest.importorskip("tyro")
 
@@ -56,6 +59,68 @@ def test_a_mistake_in_the_command_line_is_one_line(
     recipe: str, line: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert told(monkeypatch, recipe, line) == f"{said}; --help lists the options"
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("--threads -1", "--threads must not be negative, got -1"),
+        ("--workers -1", "--workers must not be negative, got -1"),
+        ("--warmup -1", "--warmup must not be negative, got -1"),
+        ("--seed -1", "--seed must lie between 0 and 2^63 - 1, got -1"),
+        (f"--seed {2**63}", f"--seed must lie between 0 and 2^63 - 1, got {2**63}"),
+        ("--minutes nan", "give --steps, or positive --minutes, got nan"),
+        ("--minutes inf", "give --steps, or positive --minutes, got inf"),
+        ("--lr nan", "--lr must be a number of at least 0, got nan"),
+        ("--name=", "--name must not be empty: it is the run's folder below --out"),
+    ],
+)
+def test_values_that_make_no_sense_are_refused_before_anything_is_written(
+    line: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert told(monkeypatch, "corenet3d", f"--out {tmp_path / 'runs'} {line}") == said
+    assert not (tmp_path / "runs").exists()
+
+
+def test_deformation_transfer_wants_no_negative_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert told(monkeypatch, "deformation_transfer", "--threads -2") == "--threads must not be negative, got -2"
+
+
+def test_a_damaged_configuration_of_a_run_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "broken"
+    folder.mkdir()
+    (folder / "model.safetensors").write_bytes(b"")
+    for text, said in (("{", "the model configuration is not JSON"), ("[1]", "must be a JSON object")):
+        (folder / "model.json").write_text(text)
+        answer = told(monkeypatch, "npt", f"--out {tmp_path} --name broken --apply a.obj b.obj")
+        assert answer.startswith(f"{folder / 'model.json'}: ") and said in answer
+
+
+def test_a_rig_with_too_little_to_make_more_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the sampling refuses is a mistake of --data, not a traceback."""
+    data, meshkit_data = recipe_module("_data"), importlib.import_module("meshkit.data")
+    body, split = meshkit_data.load_shipped("humans")
+    few = replace(split, train_identities=split.train_identities[:1])
+    monkeypatch.setattr(data, "load_shipped", lambda kind, vertices: (body, few))
+    cfg = replace(recipe_module("npt").PRESETS["tiny"], sampled_identities=5)
+    with pytest.raises(recipe_module("_run").UserError, match="--data humans: a table of at least two rows"):
+        data.data(cfg, None, 0)
+    body.identities = None
+    with pytest.raises(recipe_module("_run").UserError, match="this rig has no identities to make others of"):
+        data.with_sampled_identities(body, split, 5, seed=0)
+
+
+def test_a_file_that_changed_under_a_run_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """A worker's error comes with the traceback of its process in the message."""
+
+    def fail() -> None:
+        raise MeshFileError(
+            "Caught it in worker 0.\nTraceback:\nmeshkit.io.files.MeshFileError: a.npy: shard is damaged"
+        )
+
+    with pytest.raises(SystemExit, match="2"):
+        recipe_module("_run").guard(fail)
+    assert capsys.readouterr().err == "error: a.npy: shard is damaged\n"
 
 
 def test_it_ends_with_status_2_and_help_with_0() -> None:

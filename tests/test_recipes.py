@@ -454,7 +454,9 @@ def test_init_begins_with_the_weights_of_a_run(run: Callable[..., Path], without
             "spectral True (here False); leave out --model.spectral",
         ),
         ("npt", "corenet3d-humans", (), "architecture matching (here npt_maxpool); give weights of the same network"),
-        ("xdualnet", "nobody", (), "nobody holds no model.json: give the folder of a finished or checkpointed run"),
+        ("xdualnet", "nobody", (), "--init nobody: neither shipped weights nor a folder are named so; there are coren"),
+        ("xdualnet", "corenet-human", (), "named so: did you mean corenet3d-humans? There are corenet3d-humans, xdual"),
+        ("xdualnet", str(Path(__file__).parent), (), "holds no model.json: give the folder of a finished or checkp"),
     ],
 )
 def test_weights_of_another_network_say_what_to_type(run: Any, recipe: str, init: str, flags: Any, said: str) -> None:
@@ -515,12 +517,14 @@ def test_damaged_files_are_named_or_left_out(run: Any, tmp_path: Path, capsys: p
     damaged = place / "1_1.ply"
     damaged.write_text("not a mesh")
     words = ("corenet3d", "--data", f"folder:{place}", *FAST)
-    with pytest.raises(recipe_module("_run").UserError, match=rf"{damaged.name}.*; mend or remove .* --skip-bad$"):
+    with pytest.raises(
+        recipe_module("_run").UserError, match=rf"{damaged.name}.*; remove the file, or leave out .* --skip-bad$"
+    ):
         run(*words)
     capsys.readouterr()
     folder = run(*words, "--skip-bad")
     said = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
-    assert len(said) == 1 and re.match(r"warning: 1 of 9 mesh files were left out, the first: .*1_1.ply", said[0])
+    assert len(said) == 1 and re.match(r"warning: 1 of 9 mesh files was left out, the first: .*1_1.ply", said[0])
     assert (folder / "model.safetensors").exists()
 
 

@@ -266,7 +266,7 @@ def test_bad_pages_are_named(tmp_path: Path) -> None:
         ({}, {}, "meshes is empty"),
         (good, {"colors": {"b": VERTS[0]}}, r"colors for \['b'\], but the meshes are \['a'\]"),
         (good, {"colors": {"a": VERTS[0] - 10}}, r"values in \[0, 1\]"),
-        (good, {"notes": []}, "0 notes for 1 meshes"),
+        (good, {"notes": []}, r"a line for each of 1 meshes, got \[\]"),
         (good, {"up": "x"}, "up must be 'y' or 'z'"),
         ({"a": (VERTS[0], BODY.faces + 1)}, {}, "but there are 1000 vertices"),
         ((VERTS[0], BODY.faces), {}, "meshes must be a dict by name.* got tuple"),

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ import torch
 from measure_usual import PAIRS, measure
 from run_history import SYSTEMS, recipe_of, runs
 from safetensors.torch import save_file
-from weights_page import LENGTHS, UNITS, write_card
+from weights_page import MOVED, write_card
 
 from meshkit.batching import center
 from meshkit.data import Split, load_shipped
@@ -112,7 +111,6 @@ def main() -> None:
     distance = check(run, net, body, pairs)
     if not distance < TOLERANCE:
         raise SystemExit(f"error: 16-bit parameters move vertices by {distance:.2e}, more than {TOLERANCE:g} metres")
-    in_lengths, moved = LENGTHS[config["data"]]
     card = {
         "name": args.name,
         "system": system,
@@ -123,13 +121,13 @@ def main() -> None:
         "vertices": len(body.template),
         "split": f"{trained_on([*before, last], split)} to train on; tested on "
         f"{len(split.test_identities)} identities and {len(split.test_poses)} poses not seen in training.",
-        "figures": {in_lengths if k == "correspondence_m" else k: v for k, v in summary["test"].items()},
+        "figures": summary["test"],
         "test_pairs": summary["test_pairs"],
-        "units": re.sub(r"\bm\b", UNITS[config["data"]][1], summary["units"]),
+        "units": summary["units"],
         "parameters": summary["parameters"],
         "licence": LICENCES[config["data"]],
         "first_pairs_pmd": errors(run, body, split.test_pairs[:8]),
-        "rounding": {moved: round(distance, 6), "pairs": len(pairs)},
+        "rounding": {MOVED[config["data"]]: round(distance, 6), "pairs": len(pairs)},
         "usual": usual_range(measure([net], config["data"], len(body.template), args.usual_pairs, seed=0)[0]),
         "usual_pairs": args.usual_pairs,
         "model": asdict(model),

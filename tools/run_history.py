@@ -10,7 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from meshkit.models import GeneratorConfig, load_pretrained, pretrained_names
+from meshkit.models import GeneratorConfig, pretrained_names
+from meshkit.models.pretrained import read_card
 
 ROOT = Path(__file__).parents[1]
 FACTS = ("command", "sampled", "seed", "steps", "pairs_seen", "train_minutes", "precision", "date", "machine")
@@ -71,7 +72,7 @@ def _runs(folder: Path) -> list[dict[str, Any]]:
         "machine": machine,
     }
     if init in pretrained_names():
-        card = load_pretrained(init).card
+        card = read_card(init)
         if "before" in card:
             raise ValueError(f"it began with --init {init}, weights of several runs: begin with the last of these runs")
         check_same_bodies(config, card, f"the weights {init}")

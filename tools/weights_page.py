@@ -15,10 +15,7 @@ UNITS = {
         "units",
     ),
 }
-LENGTHS = {  # keys of the card that are lengths: only humans are in metres
-    "humans": ("correspondence_m", "largest_distance_m"),
-    "animals": ("correspondence_units", "largest_distance_units"),
-}
+MOVED = {"humans": "largest_distance_m", "animals": "largest_distance_units"}  # only humans are in metres
 GIVEN = {  # the meshes that the usual numbers are measured on
     "humans": "given at 1000, 2000, 3445 and 6890 vertices",
     "animals": "given as they are shipped, and with each face cut into four",
@@ -62,7 +59,7 @@ def markdown(name: str, card: dict[str, Any]) -> str:
     figures = card["figures"]
     rows = "\n".join(f"| {key} | {value} |" for key, value in figures.items())
     unit, short = UNITS[card["data"]]
-    moved = card["rounding"][LENGTHS[card["data"]][1]]
+    moved = card["rounding"][MOVED[card["data"]]]
     distance = f"{1e3 * moved:.3f} mm" if short == "m" else f"{moved:.1e} {short}"
     return f"""# {name}
 

@@ -156,6 +156,8 @@ def read_pickle(path: Path, *, max_bytes: int) -> dict[str, Any]:
             mapped.seek(0)
             content = _Restricted(mapped, size).load()
         content = _plain(content, {})
+    except OSError as error:
+        raise MeshFileError(f"{path}: it cannot be read ({error.strerror or error})") from error
     except Exception as error:  # a damaged pickle can raise anything
         raise MeshFileError(f"{path}: not a readable pickle of arrays ({type(error).__name__}: {error})") from error
     if not isinstance(content, dict):

@@ -137,7 +137,7 @@ def read_test_list(path: str | os.PathLike[str], entries: Iterable[MeshEntry]) -
     """
     path = Path(path)
     if not path.is_file():
-        raise MeshFileError(f"{path}: no such file")
+        raise MeshFileError(f"{path}: {'a folder, not a list' if path.is_dir() else 'no such file'}")
     places: dict[str, int] = {}
     repeated: set[str] = set()
     for k, entry in enumerate(entries):
@@ -172,7 +172,11 @@ def _scan(
 ) -> list[MeshEntry]:
     folder = Path(folder)
     if not folder.is_dir():
-        raise MeshFileError(f"{folder}: no such folder")
+        raise MeshFileError(f"{folder}: {'a file, not a folder' if folder.exists() else 'no such folder'}")
+    try:  # glob finds nothing where it may not look
+        os.listdir(folder)
+    except OSError as error:
+        raise MeshFileError(f"{folder}: it cannot be listed ({error.strerror or error})") from error
     found = {path: place for path in sorted(folder.glob(pattern)) if (place := numbers(path)) is not None}
     if not found:
         raise MeshFileError(f"{folder}: no mesh named like {example} in it")

@@ -14,6 +14,7 @@ from meshkit.data._unpickle import Record, read_pickle
 from meshkit.data.frames import Y_UP_TO_Z_UP, turn_axes
 from meshkit.data.rigged import RiggedModel
 from meshkit.io import MeshFileError
+from meshkit.io._arrays import read_arrays
 
 __all__ = ["SMAL_FAMILIES", "load_smal", "load_smpl"]
 
@@ -144,16 +145,8 @@ def _read(path: Path, max_bytes: int, wanted: tuple[str, ...]) -> dict[str, Any]
     if path.suffix != ".npz":
         raise MeshFileError(f"{path}: extension {path.suffix!r} cannot be read; use .pkl or .npz")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            # The sizes of the arrays, not of the compressed file: a small file can unpack to anything.
-            names = [key for key in wanted if key in archive.files]
-            size = sum(archive.zip.getinfo(f"{key}.npy").file_size for key in names)
-            if size > max_bytes:
-                raise MeshFileError(f"{path}: {size:,} bytes, more than the {max_bytes:,} allowed (max_bytes)")
-            return {key: archive[key] for key in names}
-    except MeshFileError:
-        raise
-    except Exception as error:  # zipfile, zlib and NumPy each have their own ways to fail
+        return dict(read_arrays(path, wanted, max_bytes))
+    except (OSError, ValueError) as error:
         raise MeshFileError(f"{path}: not a readable .npz of arrays ({error})") from error
 
 

@@ -84,6 +84,11 @@ class PosePairs(Dataset[PairBatch]):
             raise ValueError(
                 f"need identities, poses and a positive length, got {len(identities)}, {len(poses)} and {length}"
             )
+        if listed is not None and (listed.dim() != 2 or listed.shape[1] != 4 or len(listed) == 0):
+            raise ValueError(f"listed must be a pair or more (L, 4), got {tuple(listed.shape)}")
+        for name, rows in (("identities", identities), ("poses", poses), ("listed", listed)):
+            if rows is not None and (rows.is_floating_point() or rows.dtype == torch.bool):
+                raise ValueError(f"{name} must be whole numbers, rows of the model's tables, got {rows.dtype}")
         if model.identities is None or model.poses is None:
             raise ValueError("the model has no tables of identities and poses to draw from: give it both")
         # Checked here, once: the tables are then indexed without asking the device for the smallest and largest index.

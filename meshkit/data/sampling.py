@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -32,7 +34,7 @@ def sample_identities(
         ``(count, K)``.
 
     Raises:
-        ValueError: fewer than two rows.
+        ValueError: fewer than two rows, coefficients that are not finite, or a negative ``count`` or ``spread``.
 
     Example:
         >>> from meshkit.data import load_shipped
@@ -43,6 +45,10 @@ def sample_identities(
     """
     if identities.dim() != 2 or len(identities) < 2:
         raise ValueError(f"a table of at least two rows (I, K) is needed, got {tuple(identities.shape)}")
+    if count < 0 or not 0 <= spread < math.inf:
+        raise ValueError(f"count and spread must not be negative, got {count} and {spread}")
+    if not identities.isfinite().all():
+        raise ValueError("the table has coefficients that are NaN or infinite")
     mean = identities.mean(0)
     device = "cpu" if generator is None else generator.device
     z = torch.randn(count, len(identities), generator=generator, device=device, dtype=identities.dtype).to(identities)
@@ -69,7 +75,8 @@ def sample_poses(poses: Tensor, parents: Tensor, count: int, *, generator: torch
         ``(count, J, ...)``, as ``poses``.
 
     Raises:
-        ValueError: no poses, or not of these joints; ``parents`` that do not come first, or several roots.
+        ValueError: a negative ``count``; no poses, or not of these joints; ``parents`` that do not come first, or
+            several roots.
 
     Example:
         >>> from meshkit.data import load_shipped
@@ -83,6 +90,8 @@ def sample_poses(poses: Tensor, parents: Tensor, count: int, *, generator: torch
             f"a table of poses of {len(parents)} joints (P, {len(parents)}, 3) or (P, {len(parents)}, 3, 3) is needed, "
             f"got {tuple(poses.shape)}"
         )
+    if count < 0:
+        raise ValueError(f"count must not be negative, got {count}")
     check_parents(parents.tolist())
     limb = _limbs(parents.tolist())
     device = "cpu" if generator is None else generator.device

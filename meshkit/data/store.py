@@ -8,6 +8,7 @@ import os
 import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from meshkit.io import MeshFileError, atomic_write, load_mesh
 __all__ = ["MeshStore"]
 
 _FORMAT = 3
+_DTYPES = {"verts": "float32", "faces": "int32"}
+_HEADER = 64  # bytes of an .npy file before its numbers, at least
 _OPEN_MAPS = 64
 
 
@@ -70,9 +73,6 @@ class MeshStore:
             names, _ = index["paths"], index["centers"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise MeshFileError(f"{self.cache}: no store of meshes in it ({error}); build it") from error
-        missing = [k for k in range(rows[:, 3].max(initial=-1) + 1) if not self._file("verts", k).is_file()]
-        if missing:
-            raise MeshFileError(f"{self._file('verts', missing[0])}: shard is missing; delete {self.cache} and build")
         self.entries = [
             MeshEntry(Path(p), int(i), int(q)) for p, i, q in zip(names, rows[:, 0], rows[:, 1], strict=True)
         ]
@@ -83,6 +83,12 @@ class MeshStore:
         self.num_faces = torch.from_numpy(self._spans[:, 3] - self._spans[:, 2])
         self.center = torch.tensor(index["centers"]).view(-1, 3)
         self._maps: OrderedDict[tuple[str, int], Tensor] = OrderedDict()
+        for number in self.shard.unique().tolist():
+            for kind in _DTYPES:
+                path, needed = self._file(kind, number), _HEADER + 12 * self._rows_of(kind, number)
+                if not path.is_file() or path.stat().st_size < needed:
+                    state = "cut short" if path.exists() else "missing"
+                    raise MeshFileError(f"{path}: shard is {state}; delete {self.cache} and build")
 
     @classmethod
     def build(
@@ -120,7 +126,8 @@ class MeshStore:
         cache = Path(cache)
         key = _fingerprint(entries, skip_bad, shard_bytes, max_file_bytes)
         if _stored_key(cache) == key:
-            return cls(cache)
+            with suppress(MeshFileError):  # shards that were damaged since are made again
+                return cls(cache)
         cache.mkdir(parents=True, exist_ok=True)
         (cache / "index.json").unlink(missing_ok=True)  # without an index, what follows is no store until it is whole
         for stale in (*cache.glob("verts-*.npy"), *cache.glob("faces-*.npy")):
@@ -166,7 +173,8 @@ class MeshStore:
         with atomic_write(cache / "index.json") as temporary:
             temporary.write_text(json.dumps(index))
         if skipped:
-            message = f"{len(skipped)} of {len(entries)} mesh files were left out, the first: {skipped[0][1]}"
+            were = "was" if len(skipped) == 1 else "were"
+            message = f"{len(skipped)} of {len(entries)} mesh files {were} left out, the first: {skipped[0][1]}"
             warnings.warn(message, stacklevel=2)
         return cls(cache)
 
@@ -189,10 +197,22 @@ class MeshStore:
     def _file(self, kind: str, number: int) -> Path:
         return self.cache / f"{kind}-{number:05d}.npy"
 
+    def _rows_of(self, kind: str, number: int) -> int:
+        """How many rows a shard must have."""
+        spans = self._spans[(self.shard == number).numpy()]
+        return int(spans[:, 1 if kind == "verts" else 3].max(initial=0))
+
     def _map(self, kind: str, number: int) -> Tensor:
         """A memory map, of which a limited number are kept open. What is written to it stays private."""
         if (kind, number) not in self._maps:
-            self._maps[kind, number] = torch.from_numpy(np.load(self._file(kind, number), mmap_mode="c"))
+            path, rows = self._file(kind, number), self._rows_of(kind, number)
+            try:
+                array = np.load(path, mmap_mode="c")
+                if array.dtype != _DTYPES[kind] or array.shape[1:] != (3,) or len(array) < rows:
+                    raise ValueError(f"{array.dtype} {array.shape}, {rows} rows of 3 {_DTYPES[kind]} were written")
+            except (OSError, ValueError, EOFError) as error:
+                raise MeshFileError(f"{path}: shard is damaged ({error}); delete {self.cache} and build") from error
+            self._maps[kind, number] = torch.from_numpy(array)
             if len(self._maps) > _OPEN_MAPS:
                 self._maps.popitem(last=False)
         self._maps.move_to_end((kind, number))

@@ -1,5 +1,6 @@
 """Files that are replaced as a whole or not at all."""
 
+import errno
 import os
 import secrets
 from collections.abc import Iterator
@@ -23,6 +24,9 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     Yields:
         Temporary path to write to.
 
+    Raises:
+        OSError: the path is a folder, its parent is a file, or it cannot be written.
+
     Example:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
@@ -32,7 +36,12 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         'done'
     """
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "Is a folder, not a file to write", str(target))
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(errno.ENOTDIR, "Not a directory", str(target.parent)) from None
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     try:
         yield temporary

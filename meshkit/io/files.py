@@ -1,8 +1,8 @@
 """Mesh files in and out, with the order and the number of the vertices kept.
 
 Pose transfer, correspondences and per-vertex errors all rest on the row order of the vertices, so nothing here merges,
-reorders or drops a vertex. OBJ and OFF are read line by line for that reason: general readers split an OBJ by material
-and repeat vertices along texture seams. PLY, STL and GLB go through trimesh.
+reorders or drops a vertex. All formats but GLB have a reader of their own for that reason: general readers split an OBJ
+by material and repeat vertices along texture seams, and do not say where a damaged file is damaged.
 """
 
 import os
@@ -13,13 +13,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from meshkit.io._binary_readers import read_binary
-from meshkit.io._text_readers import read_obj, read_off
+from meshkit.io._binary_readers import read_glb
+from meshkit.io._obj import read_obj
+from meshkit.io._off import read_off
+from meshkit.io._ply import read_ply
+from meshkit.io._stl import read_stl
 from meshkit.io.atomic import atomic_write
+from meshkit.io.report import counted
 
 __all__ = ["MeshFileError", "MeshFileWarning", "load_mesh", "save_mesh"]
 
-_EXTENSIONS = (".glb", ".obj", ".off", ".ply", ".stl")
+_READERS = {".glb": read_glb, ".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl}
 _ROWS = 2**16  # rows formatted at a time
 
 
@@ -63,18 +67,21 @@ def load_mesh(path: str | os.PathLike[str], *, max_bytes: int = 2**28) -> tuple[
         (torch.Size([4, 3]), [[0, 1, 2], [0, 2, 3]])
     """
     path = Path(path)
-    extension = _extension(path, "read")
-    if not path.is_file():
-        raise MeshFileError(f"{path}: {'a folder, not a mesh file' if path.is_dir() else 'no such file'}")
-    if (size := path.stat().st_size) > max_bytes:
-        raise MeshFileError(f"{path}: {size:,} bytes, more than max_bytes={max_bytes:,}; raise it to read this file")
-    reader = {".obj": read_obj, ".off": read_off}.get(extension, read_binary)
     try:
-        verts, faces, polygons = reader(path, max_bytes)
+        extension = _extension(path, "read")
+        if not path.is_file():
+            raise MeshFileError(f"{path}: no such file")
+        if (size := path.stat().st_size) > max_bytes:
+            raise MeshFileError(
+                f"{path}: {size:,} bytes, more than max_bytes={max_bytes:,}; raise it to read this file"
+            )
+        verts, faces, polygons = _READERS[extension](path, max_bytes)
+    except MeshFileError:
+        raise
+    except OSError as error:
+        raise MeshFileError(f"{path}: it cannot be read ({error.strerror or error})") from error
     except Exception as error:
-        # trimesh looks for a text decoder when an STL is neither a whole binary file nor plain text.
-        reason = "damaged or truncated" if isinstance(error, ImportError) else error
-        raise MeshFileError(f"{path}: not a readable {extension[1:].upper()} mesh ({reason})") from error
+        raise MeshFileError(f"{path}: not a readable {path.suffix[1:].upper()} mesh ({error})") from error
     with np.errstate(over="ignore"):  # what overflows becomes infinite, and is reported as such
         points = verts.astype(np.float32)
     _check(points, faces, path)
@@ -129,8 +136,10 @@ def save_mesh(path: str | os.PathLike[str], verts: Tensor, faces: Tensor) -> Non
 
 def _extension(path: Path, verb: str) -> str:
     extension = path.suffix.lower()
-    if extension not in _EXTENSIONS:
-        raise MeshFileError(f"{path}: extension {path.suffix!r} cannot be {verb}; use one of {', '.join(_EXTENSIONS)}")
+    if path.is_dir():
+        raise MeshFileError(f"{path}: a folder, not a mesh file")
+    if extension not in _READERS:
+        raise MeshFileError(f"{path}: extension {path.suffix!r} cannot be {verb}; use one of {', '.join(_READERS)}")
     return extension
 
 
@@ -141,14 +150,17 @@ def _check(verts: np.ndarray, faces: np.ndarray, name: Path) -> None:
         raise MeshFileError(f"{name}: no faces; a point cloud must be meshed first")
     bad = np.flatnonzero(~np.isfinite(verts).all(1))
     if len(bad):
+        have = "has a NaN or infinite coordinate" if len(bad) == 1 else "have NaN or infinite coordinates"
         raise MeshFileError(
-            f"{name}: {len(bad)} vertices have NaN or infinite coordinates, first vertex {bad[0]} (counting from 0)"
+            f"{name}: {counted(len(bad), 'vertex')} {have}, first vertex {bad[0]} (counting from 0); mend the file or "
+            "export it again"
         )
     outside = np.flatnonzero(((faces < 0) | (faces >= len(verts))).any(1))
     if len(outside):
+        refer = "face refers" if len(outside) == 1 else "faces refer"
         raise MeshFileError(
-            f"{name}: {len(outside)} faces refer to vertices outside 0..{len(verts) - 1}, the first is face "
-            f"{outside[0]}: {faces[outside[0]].tolist()}"
+            f"{name}: {len(outside)} {refer} to vertices outside 0..{len(verts) - 1}, the first is face {outside[0]} "
+            f"(counting from 0): {faces[outside[0]].tolist()}; mend the file or export it again"
         )
 
 

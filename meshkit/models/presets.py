@@ -197,7 +197,10 @@ def load_generator(folder: str | Path) -> tuple[PoseTransferGenerator | NPT, Gen
     for name in ("model.json", "model.safetensors"):
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}: give the folder of a finished or checkpointed run")
-    config = GeneratorConfig.from_json((folder / "model.json").read_text())
+    try:
+        config = GeneratorConfig.from_json((folder / "model.json").read_text())
+    except ValueError as error:
+        raise ValueError(f"{folder / 'model.json'}: {error}") from error
     try:
         model = config.build()
         model.load_state_dict(load_file(folder / "model.safetensors"))

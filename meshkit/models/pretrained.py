@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from difflib import get_close_matches
 from importlib.resources import files
 from typing import Any
 
@@ -189,6 +190,25 @@ def _is_weights(name: str) -> bool:
     return name.endswith(".safetensors")
 
 
+def instead_of(name: str) -> str:
+    """What to say after a name that no weights have: the nearest one, if one is near, and all there are."""
+    names = pretrained_names()
+    near = get_close_matches(name.lower().replace("_", "-"), names, n=1)
+    there_are = f"here are {', '.join(names) or 'none'}"
+    return f": did you mean {near[0]}? T{there_are}" if near else f"; t{there_are}"
+
+
+def read_card(name: str) -> dict[str, Any]:
+    """The model card of shipped weights, without the weights.
+
+    Raises:
+        ValueError: no weights of that name.
+    """
+    if name not in pretrained_names():
+        raise ValueError(f"no weights are named {name!r}{instead_of(name)}")
+    return dict(json.loads((files("meshkit") / "weights" / f"{name}.json").read_text(encoding="utf-8")))
+
+
 def load_pretrained(name: str, *, device: torch.device | str = "cpu") -> PretrainedTransfer:
     """Load weights that come with meshkit, in evaluation mode.
 
@@ -213,10 +233,8 @@ def load_pretrained(name: str, *, device: torch.device | str = "cpu") -> Pretrai
     """
     from safetensors.torch import load
 
-    if name not in pretrained_names():
-        raise ValueError(f"no weights are named {name!r}; there are {', '.join(pretrained_names()) or 'none'}")
+    card = read_card(name)
     folder = files("meshkit") / "weights"
-    card = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
     config = GeneratorConfig.from_json(json.dumps(card["model"]))
     state = load((folder / f"{name}.safetensors").read_bytes())
     generator = config.build()

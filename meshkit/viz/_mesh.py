@@ -1,6 +1,8 @@
 """What every kind of picture shares: checked arrays, the camera, the projection to pixels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +16,42 @@ _MARGIN = 1.08  # picture side over the extent of the body, when neither scale n
 
 
 def as_array(values: Tensor | ArrayLike) -> Array:
-    return np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
+    try:
+        return np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"an array of numbers is needed, got {type(values).__name__}: {error}") from None
+
+
+def as_mesh(verts: Tensor | ArrayLike, faces: Tensor | ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+    """One checked mesh as arrays."""
+    points, corners = as_array(verts), as_array(faces)
+    if not (np.isfinite(corners) & (np.abs(corners) < 2**53)).all() or (corners % 1).any():
+        raise ValueError("faces must be whole numbers: the vertices at their corners, counted from 0")
+    triangles = corners.astype(np.int64)
+    check_mesh(points, triangles)
+    return points, triangles
+
+
+def as_named_mesh(name: str, given: Any) -> tuple[Array, NDArray[np.int64]]:
+    """A checked mesh of several, which errors name."""
+    if isinstance(given, Tensor) or not isinstance(given, Sequence) or len(given) != 2:
+        raise ValueError(f"mesh {name!r} must be (verts, faces), got {type(given).__name__}")
+    try:
+        return as_mesh(*given)
+    except ValueError as error:
+        raise ValueError(f"mesh {name!r}: {error}") from None
+
+
+def check_size(size: tuple[int, int]) -> None:
+    if not isinstance(size, Sequence) or len(size) != 2 or not all(isinstance(n, int | np.integer) for n in size):
+        raise ValueError(f"size must be the width and height in pixels, two whole numbers, got {size!r}")
+    if min(size) < 1:
+        raise ValueError(f"size must be at least 1, got {size}")
+
+
+def check_angles(azimuth: float, elevation: float) -> None:
+    if not np.isfinite([azimuth, elevation]).all():
+        raise ValueError(f"azimuth and elevation must be finite degrees, got {azimuth} and {elevation}")
 
 
 def check_mesh(points: Array, triangles: NDArray[np.int64]) -> None:
@@ -24,7 +61,7 @@ def check_mesh(points: Array, triangles: NDArray[np.int64]) -> None:
         raise ValueError(f"nothing to draw: {len(points)} vertices and {len(triangles)} faces")
     bad = int((~np.isfinite(points)).any(1).sum())
     if bad:
-        raise ValueError(f"{bad} of {len(points)} vertices have NaN or infinite coordinates")
+        raise ValueError(f"{bad} of {len(points)} vertices {'has' if bad == 1 else 'have'} NaN or infinite coordinates")
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise ValueError(
             f"face indices run from {triangles.min()} to {triangles.max()}, but there are {len(points)} vertices; "
@@ -68,8 +105,8 @@ def fit_view(
     """Camera that shows all points, or ``scale`` units along the shorter side, or the box ``bounds``."""
     if up not in {"y", "z"}:
         raise ValueError(f"up must be 'y' or 'z', got {up!r}")
-    if min(size) < 1:
-        raise ValueError(f"size must be at least 1, got {size}")
+    check_size(size)
+    check_angles(azimuth, elevation)
     if scale is not None and not 0 < scale < np.inf:
         raise ValueError(f"scale must be a length above 0, got {scale}")
     axes = _camera(azimuth, elevation, up)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from meshkit.io import atomic_write
-from meshkit.viz._mesh import as_array, check_mesh
+from meshkit.viz._mesh import as_mesh, check_angles, check_size
 from meshkit.viz.rasterizer import render
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["save_animation", "turntable"]
 
 Picture = NDArray[np.uint8]
+_LONGEST = 655.0  # seconds: a GIF counts hundredths in 16 bits
 
 
 def save_animation(
@@ -31,12 +32,12 @@ def save_animation(
     Args:
         path: the file to write, ending in ``.gif``; its folder is made if missing.
         frames: (H, W, 3) uint8 pictures, as :func:`meshkit.viz.render` returns them, or Pillow images.
-        seconds: time that each frame is shown, 0.02 or more.
+        seconds: time that each frame is shown, 0.02 to 655.
         loop: begin again at the end.
 
     Raises:
         ValueError: no frame, frames of unequal size or other type, another suffix, or a time below 0.02 s, which
-            viewers slow down.
+            viewers slow down, or above 655 s.
 
     Example:
         >>> import tempfile
@@ -49,12 +50,13 @@ def save_animation(
 
     if Path(path).suffix.lower() != ".gif":
         raise ValueError(f"an animation is written as .gif, got {Path(path).name!r}")
-    if seconds < 0.02:
-        raise ValueError(f"seconds must be 0.02 or more, got {seconds}")
+    if not 0.02 <= seconds <= _LONGEST:
+        raise ValueError(f"seconds must be 0.02 or more, and {_LONGEST:g} at most, got {seconds}")
     pictures = [np.asarray(frame) for frame in frames]
     if not pictures:
         raise ValueError("no frames to write")
-    if any(p.dtype != np.uint8 or p.ndim != 3 or p.shape[2] != 3 or p.shape != pictures[0].shape for p in pictures):
+    first = pictures[0].shape
+    if 0 in first or any(p.dtype != np.uint8 or p.shape != first or p.shape[2:] != (3,) for p in pictures):
         kinds = sorted({f"{p.dtype} {p.shape}" for p in pictures})
         raise ValueError(f"frames must be uint8 (H, W, 3) of one size, got {', '.join(kinds)}")
     step = max(1, len(pictures) // 8)
@@ -103,8 +105,9 @@ def turntable(
     """
     if frames < 1:
         raise ValueError(f"a turntable needs a frame or more, got {frames}")
-    points, triangles = as_array(verts), as_array(faces).astype(np.int64)
-    check_mesh(points, triangles)
+    points, triangles = as_mesh(verts, faces)
+    check_size(size)
+    check_angles(0.0, elevation)
     # The cylinder around the body looks the same from every side.
     low, high = points.min(0), points.max(0)
     middle, flat = (low + high) / 2, [0, 2 if up == "y" else 1]

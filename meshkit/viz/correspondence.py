@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from meshkit.viz._mesh import Array, View, as_array, check_mesh, fit_view
+from meshkit.viz._mesh import Array, View, as_array, as_named_mesh, fit_view
 from meshkit.viz.rasterizer import rasterize, render
 
 if TYPE_CHECKING:
@@ -133,9 +133,7 @@ def correspondence_figure(
 
     from meshkit.viz.figures import paste_title
 
-    (points, faces), (other, other_faces) = ((as_array(v), as_array(f).astype(np.int64)) for v, f in (source, target))
-    for mesh in ((points, faces), (other, other_faces)):
-        check_mesh(*mesh)
+    (points, faces), (other, other_faces) = as_named_mesh("source", source), as_named_mesh("target", target)
     index = _match_indices(as_array(matches), len(other))
     right = np.ones(len(points), dtype=bool) if correct is None else as_array(correct).astype(bool)
     if len(index) != len(points) or right.shape != (len(points),):

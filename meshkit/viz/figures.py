@@ -2,12 +2,14 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from meshkit.io import atomic_write
+from meshkit.viz._mesh import as_array
 from meshkit.viz.rasterizer import error_colors
 
 if TYPE_CHECKING:
@@ -101,10 +103,11 @@ def plot_curves(
         series: name of each curve and its x and y values, equally many. Values that are not finite leave a gap.
         xlabel: title of the horizontal axis, with its unit.
         ylabel: title of the vertical axis, with its unit.
-        logy: logarithmic vertical axis.
+        logy: logarithmic vertical axis, if any value is above 0.
 
     Raises:
-        ValueError: no curve, or a curve without a finite point or with unequal numbers of x and y values.
+        ValueError: no curve, another suffix than ``.png``, or a curve without a finite point or with
+            unequal numbers of x and y values.
 
     Example:
         >>> import tempfile, pathlib
@@ -117,9 +120,15 @@ def plot_curves(
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, StrMethodFormatter
 
-    curves = {name: (np.asarray(x, float), np.asarray(y, float)) for name, (x, y) in series.items()}
-    if not curves:
+    if Path(path).suffix.lower() != ".png":
+        raise ValueError(f"curves are written as .png, got {Path(path).name!r}")
+    if not series:
         raise ValueError("nothing to plot: series is empty")
+    curves = {}
+    for name, pair in series.items():
+        if not isinstance(pair, Sequence | np.ndarray) or len(pair) != 2:
+            raise ValueError(f"curve {name!r} must be (x values, y values), got {type(pair).__name__}")
+        curves[name] = as_array(pair[0]), as_array(pair[1])
     for name, (x, y) in curves.items():
         if x.ndim != 1 or x.shape != y.shape or not (np.isfinite(x) & np.isfinite(y)).any():
             raise ValueError(
@@ -130,7 +139,7 @@ def plot_curves(
     for number, (name, (x, y)) in enumerate(curves.items()):
         color, marker = _PALETTE[number % len(_PALETTE)], "o" if len(x) <= 25 else None
         axes.plot(x, y, label=name, color=color, linewidth=1.6, marker=marker, markersize=3.5)
-    if logy:
+    if logy and any((y > 0).any() for _, y in curves.values()):
         axes.set_yscale("log", nonpositive="mask")
         low, high = axes.get_ylim()
         if high < 100 * low:  # few decades: plain numbers, in between as well

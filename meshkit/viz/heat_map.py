@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from meshkit.viz._mesh import as_array, check_mesh, fit_view
+from meshkit.viz._mesh import as_array, as_mesh, fit_view
 from meshkit.viz.figures import contact_sheet
 from meshkit.viz.rasterizer import error_colors, render
 
@@ -56,12 +56,13 @@ def error_heat_map(
         >>> figure.mode
         'RGB'
     """
-    points, triangles, values = as_array(verts), as_array(faces).astype(np.int64), as_array(errors)
-    check_mesh(points, triangles)
+    (points, triangles), values = as_mesh(verts, faces), as_array(errors)
     if values.shape != points.shape[:1] or not np.isfinite(values).all():
         raise ValueError(f"errors must be {len(points)} finite numbers, one per vertex, got shape {values.shape}")
     if not azimuths or (titles is not None and len(titles) != len(azimuths)):
         raise ValueError(f"{len(titles or ())} titles for {len(azimuths)} views")
+    if vmax is None and values.min() < 0:
+        raise ValueError(f"errors must be 0 or more, the least is {values.min():.3g}; give vmax to show it as 0")
     top = float(np.percentile(values, 99)) or float(values.max()) or 1.0 if vmax is None else vmax
     colors = error_colors(values, vmax=top)
     cameras = [

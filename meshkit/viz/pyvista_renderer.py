@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from meshkit.viz._mesh import CLAY, as_array, check_colors, check_mesh, fit_view
+from meshkit.viz._mesh import CLAY, as_array, as_mesh, check_colors, fit_view
 
 __all__ = ["render_pyvista"]
 
@@ -52,8 +52,7 @@ def render_pyvista(
         ImportError: pyvista is not installed.
         ValueError: as :func:`meshkit.viz.render`.
     """
-    points, triangles = as_array(verts), as_array(faces).astype(np.int64)
-    check_mesh(points, triangles)
+    points, triangles = as_mesh(verts, faces)
     albedo = np.broadcast_to(CLAY, points.shape) if colors is None else as_array(colors)
     check_colors(points, albedo)
     if shading not in {"smooth", "flat"}:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from meshkit.viz._mesh import CLAY, GAMMA, Array, as_array, check_colors, check_mesh, fit_view
+from meshkit.viz._mesh import CLAY, GAMMA, Array, as_array, as_mesh, check_colors, check_size, fit_view
 
 __all__ = ["error_colors", "render"]
 
@@ -69,18 +69,21 @@ def render(
         >>> picture.shape, picture.dtype
         ((48, 64, 3), dtype('uint8'))
     """
-    points, triangles = as_array(verts), as_array(faces).astype(np.int64)
-    check_mesh(points, triangles)
+    points, triangles = as_mesh(verts, faces)
     albedo = np.broadcast_to(CLAY, points.shape) if colors is None else as_array(colors)
     check_colors(points, albedo)
     if shading not in {"smooth", "flat", "none"}:
         raise ValueError(f"shading must be 'smooth', 'flat' or 'none', got {shading!r}")
-    if min(size) < 1 or supersample < 1:
-        raise ValueError(f"size and supersample must be at least 1, got {size} and {supersample}")
+    check_size(size)
+    if supersample < 1:
+        raise ValueError(f"supersample must be at least 1, got {supersample}")
+    paper = as_array(background)
+    if paper.shape != (3,) or not ((paper >= 0) & (paper <= 1)).all():
+        raise ValueError(f"background must be RGB in [0, 1], got {background}")
 
     width, height = size[0] * supersample, size[1] * supersample
     view = fit_view(points, (width, height), azimuth=azimuth, elevation=elevation, up=up, scale=scale, bounds=bounds)
-    picture = np.tile(np.asarray(background, dtype=np.float64), (width * height, 1))
+    picture = np.tile(paper, (width * height, 1))
     hit, face, barycentric = rasterize(view.project(points), triangles, width, height)
     corner = triangles[face]
     color = np.einsum("pk,pkc->pc", barycentric, albedo[corner])

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from meshkit.io import atomic_write
-from meshkit.viz._mesh import CLAY, GAMMA, as_array, check_colors, check_mesh
+from meshkit.viz._mesh import CLAY, GAMMA, as_array, as_named_mesh, check_angles, check_colors
 
 __all__ = ["save_html"]
 
@@ -52,7 +52,8 @@ def save_html(
 
     Raises:
         ValueError: no mesh, a mesh or colours that :func:`meshkit.viz.render` would refuse, colours for an unknown
-            name, another number of notes, or an unknown ``up``.
+            name, another number of notes, an unknown ``up``, an angle that is not finite, or another suffix than
+            ``.html``.
 
     Example:
         >>> import tempfile, torch
@@ -61,18 +62,23 @@ def save_html(
         >>> "a triangle" in file.read_text()
         True
     """
+    if Path(path).suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"a page is written as .html, got {Path(path).name!r}")
     for name, given in (("meshes", meshes), ("colors", colors if colors is not None else {})):
         if not isinstance(given, Mapping):
             raise ValueError(f'{name} must be a dict by name, such as {{"body": ...}}, got {type(given).__name__}')
     if not meshes:
         raise ValueError("nothing to show: meshes is empty")
+    if odd := [name for name in meshes if not isinstance(name, str)]:
+        raise ValueError(f"the names of meshes must be text, got {odd[0]!r}")
+    check_angles(azimuth, elevation)
     if up not in {"y", "z"}:
         raise ValueError(f"up must be 'y' or 'z', got {up!r}")
     unknown = set(colors or ()) - set(meshes)
     if unknown:
         raise ValueError(f"colors for {sorted(unknown)}, but the meshes are {list(meshes)}")
-    if notes is not None and len(notes) != len(meshes):
-        raise ValueError(f"{len(notes)} notes for {len(meshes)} meshes")
+    if notes is not None and (isinstance(notes, str) or len(notes) != len(meshes)):
+        raise ValueError(f"notes must be a list with a line for each of {len(meshes)} meshes, got {notes!r}")
     glb, counts = _glb(meshes, colors or {})
     view = {
         "names": list(meshes),
@@ -101,11 +107,7 @@ def _glb(meshes: Mapping[str, MeshLike], colors: Mapping[str, Tensor | ArrayLike
 
     scene, counts = trimesh.Scene(), []
     for name, given in meshes.items():
-        if isinstance(given, Tensor) or not isinstance(given, Sequence) or len(given) != 2:
-            raise ValueError(f"mesh {name!r} must be (verts, faces), got {type(given).__name__}")
-        verts, faces = given
-        points, triangles = as_array(verts), as_array(faces).astype(np.int64)
-        check_mesh(points, triangles)
+        points, triangles = as_named_mesh(name, given)
         rgb = np.broadcast_to(CLAY, points.shape) if name not in colors else as_array(colors[name])
         check_colors(points, rgb)
         linear = np.rint(255 * rgb**GAMMA).astype(np.uint8)  # GLB keeps colours in linear light
