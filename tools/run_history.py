@@ -108,7 +108,7 @@ def command(config: dict[str, Any]) -> str:
     words = [f"python recipes/{recipe.__name__}.py --preset {config['preset']} --data {config['data']}"]
     words.append(f"--seed {config['seed']}")
     preset = json.loads(json.dumps(asdict(recipe.PRESETS[config["preset"]]), default=str))
-    # A run that was begun before a setting existed has that setting's default, not what the preset has made of it since.
+    # A run begun before a setting existed has its default, not what the preset has made of it since.
     config = config | {"model": asdict(GeneratorConfig()) | config["model"]}
     words += differences(preset, {k: v for k, v in config.items() if k not in IGNORED}, "")
     return " ".join(words)
