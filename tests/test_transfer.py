@@ -4,6 +4,7 @@
 transfer must be a rigid motion of the identity mesh into the frame and place of the pose mesh.
 """
 
+import gc
 import itertools
 import json
 import math
@@ -11,6 +12,7 @@ import os
 import re
 import struct
 import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,10 +34,12 @@ from meshkit.topology import vertex_normals
 from meshkit.transfer import (
     Confidence,
     PoseTransfer,
+    UnusablePosesError,
     _kinds,
     read_sequence,
     save_page,
     save_picture,
+    sequence,
     transfer_pose,
     transfer_sequence,
     usual_range,
@@ -743,6 +747,63 @@ def test_what_the_reader_says_of_the_first_pose_is_kept(person, moves, tmp_path)
     alone = transfer_pose(person, tmp_path / "p0.obj", weights=copier(), **UPRIGHT).report.pose.notes
     (result,) = transfer_sequence(person, tmp_path, weights=copier(), **UPRIGHT)
     assert "split into triangles" in alone[0] and result.report.pose.notes == alone
+
+
+@pytest.fixture
+def poses_some_bad(moves, tmp_path) -> Path:
+    """A folder of six poses: 1 is text, 2 has a vertex that is none, 4 is flat: it follows the faces of 0."""
+    verts, faces = moves
+    folder = tmp_path / "poses"
+    for number, place in ((0, 0), (2, 1), (3, 1), (5, 2)):
+        save_mesh(folder / f"p_{number}.obj", verts[place], faces)
+    (folder / "p_1.obj").write_text("f 1 2\n")
+    text = (folder / "p_2.obj").read_text().splitlines()
+    (folder / "p_2.obj").write_text("\n".join(["v nan 0 0", *text[1:]]))
+    (folder / "p_4.obj").write_text(re.sub("v .*", "v 1 1 1", (folder / "p_0.obj").read_text()))
+    return folder
+
+
+def test_all_bad_poses_are_listed_before_the_first_transfer(person, poses_some_bad, monkeypatch):
+    made = []
+    monkeypatch.setattr(PoseTransfer, "apply", lambda *_, **__: made.append(1))
+    with pytest.raises(UnusablePosesError, match=r"3 of 6 poses cannot be used.*skip_bad") as caught:
+        next(transfer_sequence(person, poses_some_bad, weights=copier(), **UPRIGHT))
+    assert not made and len(caught.value.reasons) == 3
+    names = [str(poses_some_bad / f"p_{number}.obj") for number in (1, 2, 4)]
+    assert all(reason.startswith(name) for reason, name in zip(caught.value.reasons, names, strict=True))
+    assert "no surface area" in caught.value.reasons[2]
+    assert str(caught.value).splitlines()[1:] == [f"  {reason}" for reason in caught.value.reasons]
+
+
+def test_bad_poses_are_left_out_and_told(person, moves, poses_some_bad):
+    options = {"weights": copier(), "skip_bad": True, **UPRIGHT}
+    with pytest.warns(UserWarning, match="3 of 6 poses are left out") as caught:
+        results = list(transfer_sequence(person, poses_some_bad, **options))
+    assert [Path(result.report.pose.name).name for result in results] == ["p_0.obj", "p_3.obj", "p_5.obj"]
+    assert len(caught) == 1 and all(f"p_{number}.obj" in str(caught[0].message) for number in (1, 2, 4))
+    with pytest.warns(UserWarning, match=r"a pose is left out: .*p_\d\.obj") as caught:  # as they come
+        later = list(transfer_sequence(person, iter(read_sequence(poses_some_bad)), **options))
+    assert len(caught) == 3
+    assert_near(torch.stack([r.verts for r in later]), torch.stack([r.verts for r in results]), 1e-6)
+    for number in (0, 3, 5):
+        (poses_some_bad / f"p_{number}.obj").unlink()
+    with pytest.raises(UnusablePosesError, match="3 of 3 poses cannot be used; there is nothing to transfer"):
+        next(transfer_sequence(person, poses_some_bad, **options))
+
+
+def test_checking_poses_keeps_none_of_them(person, moves, tmp_path, monkeypatch):
+    alive: list[weakref.ref] = []
+
+    def load(path):
+        gc.collect()
+        assert sum(ref() is not None for ref in alive) <= 1, "the one before, until it is replaced"
+        verts = moves[0][int(path.stem)].clone()
+        alive.append(weakref.ref(verts))
+        return verts, moves[1]
+
+    monkeypatch.setattr("meshkit.transfer._open.load_mesh", load)
+    check = sequence._Check()
+    assert [check(number, tmp_path / f"{number % 3}.obj") for number in range(6)] == [None] * 6
 
 
 def test_a_broken_pose_in_a_sequence_is_named(person, moves):
