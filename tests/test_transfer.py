@@ -11,6 +11,7 @@ import math
 import os
 import re
 import struct
+import subprocess
 import sys
 import weakref
 from dataclasses import replace
@@ -23,7 +24,9 @@ import trimesh
 from conftest import assert_near
 from torch import Tensor, nn
 
+import meshkit._transfer_command as front
 import meshkit.transfer._choose as choose
+from meshkit._transfer_command import main, parser
 from meshkit.batching import center
 from meshkit.data import load_animals, load_humans, load_shipped
 from meshkit.io import MeshFileError, load_mesh, save_mesh
@@ -47,8 +50,7 @@ from meshkit.transfer import (
 from meshkit.transfer._frames import axis_name, axis_vector, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import Likeness, guess_kind
 from meshkit.transfer._open import named, open_mesh
-from meshkit.transfer._units import find_scale, scale_to
-from meshkit.transfer.command import main, parser
+from meshkit.transfer._units import UNITS, find_scale, scale_to
 from meshkit.transfer.confidence import roughness, row_entropies
 from meshkit.transfer.report import Doubt
 
@@ -829,6 +831,11 @@ def command(*words: object) -> None:
         (["id.obj", "id.obj", "-o", "x.txt"], "the result is written as .obj"),
         (["id.obj", "id.obj", "-o", "x.npz"], "the result is written as .obj"),
         (["id.obj", "id.obj", "-o", "id.obj"], "would overwrite an input"),
+        (["id.obj", "id.obj", "-o", "out.obj", "--report", "id.obj"], "would overwrite an input"),
+        (["folder", "id.obj"], "folder: a folder; the identity is one mesh"),
+        (["id.obj", "id.obj", "--refine", "-1"], "--refine must be a positive weight, got -1"),
+        (["id.obj", "id.obj", "--refine", "1", "--no-refine"], "exclude each other"),
+        (["id.obj", "id.obj", "--pose-up", "+z", "--pose-facing", "-z"], "--pose-facing -z must be at right angles"),
         (["id.obj", "id.obj", "--weights", "none"], "weights must be 'auto'"),
         (["bad.obj", "id.obj"], "bad.obj: not a readable OBJ mesh"),
     ],
@@ -837,6 +844,7 @@ def test_mistakes_are_one_line_and_status_2(words, message, person, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     save_mesh("id.obj", *person)
     Path("bad.obj").write_text("f 1 2\n")
+    Path("folder").mkdir()
     with pytest.raises(SystemExit) as caught:
         command(*words)
     assert caught.value.code == 2
@@ -849,7 +857,8 @@ def test_mistakes_are_one_line_and_status_2(words, message, person, tmp_path, mo
     [
         ["id.obj", "poses", "-o", "poses/pose.obj"],
         ["id.obj", "poses", "-o", "elsewhere/../poses/new.obj"],
-        ["out_0000.obj", "poses", "-o", "out.obj"],
+        ["out_pose_0001.obj", "poses", "-o", "out.obj"],
+        ["id.obj", "poses", "-o", "out.npz", "--report", "poses/pose_0000.obj"],
         ["id.obj", "moves_0000.glb", "-o", "moves.glb"],
     ],
 )
@@ -857,7 +866,7 @@ def test_many_results_never_overwrite_an_input(words, person, moves, tmp_path, m
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
     Path("elsewhere").mkdir()
-    for name in ("id.obj", "out_0000.obj"):
+    for name in ("id.obj", "out_pose_0001.obj"):
         save_mesh(name, *person)
     scene = trimesh.Scene()
     for number, frame in enumerate(moves[0]):
@@ -871,6 +880,95 @@ def test_many_results_never_overwrite_an_input(words, person, moves, tmp_path, m
     error = capsys.readouterr().err
     assert caught.value.code == 2 and error.count("\n") == 1 and "overwrite" in error
     assert {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))} == before
+
+
+QUIET = ["--no-picture", "--no-html", "--quiet"]
+AXES = [f"--{name.replace('_', '-')}={axis}" for name, axis in UPRIGHT.items()]
+
+
+def test_results_are_named_after_the_files_of_their_poses(person, moves, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
+    save_mesh(tmp_path / "id.obj", *person)
+    sources = ("jump.obj", "p10.obj", "p9.obj", "p9.ply")
+    for name, frame in zip(sources, moves[0][[0, 1, 2, 2]], strict=True):
+        save_mesh(tmp_path / "poses" / name, frame, moves[1])
+    words = [tmp_path / "id.obj", tmp_path / "poses", *AXES, "--weights", "copy", *QUIET]
+    command(*words, "-o", tmp_path / "r" / "out.obj", "--report", tmp_path / "report.json")
+    named = ("out_jump.obj", "out_p9_obj.obj", "out_p9_ply.obj", "out_p10.obj")  # in the order of the poses
+    assert sorted(os.listdir(tmp_path / "r")) == sorted(named)
+    reports = json.loads((tmp_path / "report.json").read_text())
+    assert [Path(report["file"]).name for report in reports] == list(named)
+    assert reports[0]["numbers"]["edge_change"] == pytest.approx(0, abs=1e-5)
+    assert (reports[3]["pose"]["up"], reports[3]["pose"]["vertices"], reports[3]["doubts"]) == ("+z", 2000, [])
+    command(*words, "-o", tmp_path / "out.npz")
+    with np.load(tmp_path / "out.npz") as archive:
+        assert archive["names"].tolist() == ["jump.obj", "p9.obj", "p9.ply", "p10.obj"]
+        last = torch.from_numpy(archive["verts"][3])
+    assert torch.equal(load_mesh(tmp_path / "r" / "out_p10.obj")[0], last)
+    save_mesh(tmp_path / "poses" / "p9_obj.stl", moves[0][0], moves[1])
+    with pytest.raises(SystemExit):
+        command(*words, "-o", tmp_path / "r" / "out.obj")
+    assert "would have one name, p9_obj: rename one of them" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".npz"])
+def test_the_command_leaves_out_bad_poses(suffix, person, poses_some_bad, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
+    save_mesh(tmp_path / "id.obj", *person)
+    out = tmp_path / "r" / f"out{suffix}"
+    words = [tmp_path / "id.obj", poses_some_bad, *AXES, "--weights", "copy", *QUIET, "-o", out]
+    with pytest.raises(SystemExit):
+        command(*words)
+    error = capsys.readouterr().err
+    assert error.startswith("error: 3 of 6 poses cannot be used;") and "--skip-bad" in error
+    assert [Path(line.split(":")[0]).name for line in error.splitlines()[1:]] == ["p_1.obj", "p_2.obj", "p_4.obj"]
+    assert not out.parent.exists()
+    command(*words, "--skip-bad")
+    error = capsys.readouterr().err
+    assert error.startswith("warning: 3 of 6 poses are left out:\n  ") and len(error.splitlines()) == 4
+    if suffix == ".obj":
+        assert sorted(os.listdir(out.parent)) == ["out_p_0.obj", "out_p_3.obj", "out_p_5.obj"]
+    else:
+        with np.load(out) as archive:
+            assert archive["names"].tolist() == ["p_0.obj", "p_3.obj", "p_5.obj"] and len(archive["verts"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("suffix", "kept"), [(".obj", "2 files, {}_a.obj to {}_b.obj"), (".npz", "1 file, {}_partial.npz")]
+)
+@pytest.mark.parametrize("error", [ValueError("odd"), KeyboardInterrupt()])
+def test_what_is_kept_after_an_error_is_told(suffix, kept, error, person, moves, tmp_path, monkeypatch, capsys):
+    apply, count = PoseTransfer.apply, itertools.count()
+    monkeypatch.setattr(PoseTransfer, "apply", lambda *a, **o: apply(*a, **o) if next(count) < 2 else _raise(error))
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
+    save_mesh(tmp_path / "id.obj", *person)
+    for name, frame in zip("abc", moves[0], strict=True):
+        save_mesh(tmp_path / "poses" / f"{name}.obj", frame, moves[1])
+    out = tmp_path / "r" / f"out{suffix}"
+    with pytest.raises(SystemExit) as caught:
+        command(tmp_path / "id.obj", tmp_path / "poses", *AXES, "--weights", "copy", *QUIET, "-o", out)
+    assert caught.value.code == (2 if isinstance(error, ValueError) else 130)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == f"error: {'odd' if isinstance(error, ValueError) else 'interrupted'}"
+    assert second == f"kept: {kept.replace('{}', str(out.with_suffix('')))}"
+    assert len(os.listdir(out.parent)) == (2 if suffix == ".obj" else 1)
+    if suffix == ".npz":
+        with np.load(tmp_path / "r" / "out_partial.npz") as archive:
+            assert archive["verts"].shape == (2, 1000, 3)
+
+
+def test_mistakes_are_found_before_pytorch_is_imported(tmp_path):
+    code = (
+        "import sys\nfrom meshkit._transfer_command import main\n"
+        "try: main(sys.argv[1:])\nexcept SystemExit as end: sys.exit(end.code + ('torch' in sys.modules))"
+    )
+    for words in (["none.obj", "x.obj"], [tmp_path, tmp_path, "--refine", "-1"], ["a", "b", "--frame", "c"]):
+        done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True)
+        assert done.returncode == 2 and done.stderr.startswith("error: "), done.stderr
+
+
+def test_the_commands_units_are_those_of_the_package():
+    assert tuple(UNITS) == front.UNITS
 
 
 def test_a_device_without_memory_is_one_line(person, tmp_path, monkeypatch, capsys):
@@ -892,7 +990,7 @@ def test_any_kind_of_value_error_gets_the_meshs_name():
         named("pose", lambda: _raise(MeshFileError("m.obj: damaged")))
 
 
-def _raise(error: Exception) -> None:
+def _raise(error: BaseException) -> None:
     raise error
 
 
@@ -964,8 +1062,9 @@ def test_the_command_takes_sequences(person, moves, tmp_path, monkeypatch, capsy
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize(("count", "said"), [(0, ""), (1, "1 warning: see"), (2, "2 warnings: see")])
-def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("count", "said"), [(0, ""), (1, "1 warning"), (2, "2 warnings")])
+@pytest.mark.parametrize("saved", [None, "r/numbers.json"])
+def test_the_caption_counts_the_warnings(count, said, saved, person, tmp_path, monkeypatch):
     from PIL import Image
 
     seen = []
@@ -977,8 +1076,8 @@ def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypa
     monkeypatch.setattr("meshkit.transfer.output.contact_sheet", sheet)
     result = transfer_pose(person, person, weights=copier(), **UPRIGHT)
     report = replace(result.report, doubts=(Doubt("", "odd"),) * count)
-    save_picture(tmp_path / "x.png", [replace(result, report=report)], size=20)
-    assert seen[0][2] == (f"{said} the report" if said else "")
+    save_picture(tmp_path / "x.png", [replace(result, report=report)], size=20, report=saved)
+    assert seen[0][2] == (f"{said}: see numbers.json" if said and saved else said)
 
 
 def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, monkeypatch):

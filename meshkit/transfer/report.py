@@ -1,11 +1,12 @@
 """What a transfer returns: the mesh, what was done, and how far to trust it."""
 
 import re
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
+from meshkit.transfer._frames import axis_name
 from meshkit.transfer._prepare import Prepared
 from meshkit.transfer.confidence import Confidence
 
@@ -73,6 +74,19 @@ class TransferReport:
         """Name of the mesh that a doubt is about; the pose mesh's if it is about the two together."""
         return self.identity.name if doubt.role == "identity" else self.pose.name
 
+    def as_dict(self) -> dict[str, Any]:
+        """Numbers, doubts and what was done, in types that JSON knows."""
+        return {
+            "identity": _facts(self.identity),
+            "pose": _facts(self.pose),
+            "weights": self.weights,
+            "frame": self.frame,
+            "refined": self.refined,
+            "seconds": self.seconds,
+            "numbers": asdict(self.confidence),
+            "doubts": [doubt._asdict() for doubt in self.doubts],
+        }
+
     def __str__(self) -> str:
         numbers = self.confidence
         facts = [f"edges change by {numbers.edge_change:.1%}"]
@@ -109,6 +123,20 @@ class TransferResult:
     faces: Tensor
     report: TransferReport
     views: tuple[tuple[Tensor, Tensor], ...]
+
+
+def _facts(mesh: Prepared) -> dict[str, Any]:
+    return {
+        "name": mesh.name,
+        "vertices": mesh.opened.report.num_verts,
+        "faces": mesh.opened.report.num_faces,
+        "unit": mesh.scale.unit,
+        "scaled_by": mesh.scale.factor,
+        "up": axis_name(mesh.up),
+        "facing": axis_name(-mesh.rotation[1]),
+        "axes": mesh.found,
+        "done": list(mesh.notes),
+    }
 
 
 def _indented(text: str) -> str:

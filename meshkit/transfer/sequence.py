@@ -202,21 +202,15 @@ def transfer_sequence(
         identity_unit=identity_unit,
         device=device,
     )
-    check, bad = _Check(), dict[int, str]()
-    if isinstance(meshes, Sequence):
-        bad = {number: why for number, mesh in enumerate(meshes) if (why := check(number, mesh))}
-        if bad and (not skip_bad or len(bad) == len(meshes)):
-            raise UnusablePosesError(tuple(bad.values()), len(meshes))
-    if bad:
-        told = "\n  ".join((f"{len(bad)} of {len(meshes)} poses are left out:", *map(_folded, bad.values())))
-        warnings.warn(told, stacklevel=2)
+    check = _Check()
+    bad = _bad_ones(meshes, check, skip_bad) if isinstance(meshes, Sequence) else None
     first: Prepared | None = None
     before: Prepared | None = None
     follower: _Follower | None = None
     for number, mesh in enumerate(meshes):
-        if number in bad:
+        if bad is not None and number in bad:
             continue
-        if skip_bad and not isinstance(meshes, Sequence) and (why := check(number, mesh)):
+        if bad is None and skip_bad and (why := check(number, mesh)):
             warnings.warn(f"a pose is left out: {_folded(why)}", stacklevel=2)
             continue
         start = time.perf_counter()
@@ -253,6 +247,17 @@ class _Check:
         except ValueError as error:
             return str(error)
         return None
+
+
+def _bad_ones(meshes: Sequence[Mesh], check: _Check, skip_bad: bool) -> set[int]:
+    """Numbers of the poses that are left out."""
+    bad = {number: why for number, mesh in enumerate(meshes) if (why := check(number, mesh))}
+    if bad and (not skip_bad or len(bad) == len(meshes)):
+        raise UnusablePosesError(tuple(bad.values()), len(meshes))
+    if bad:
+        told = (f"{len(bad)} of {len(meshes)} poses are left out:", *map(_folded, bad.values()))
+        warnings.warn("\n  ".join(told), stacklevel=3)
+    return set(bad)
 
 
 def _check_follower(name: str, verts: Tensor, faces: Tensor) -> None:
