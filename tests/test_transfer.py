@@ -342,7 +342,7 @@ def test_a_shape_between_the_kinds_is_taken_for_a_person_in_doubt(person, monkey
     monkeypatch.setattr(
         choose, "load_pretrained", lambda name: copier(name=name, data=cards[name], figures={"pmd": 1.0}, usual=WIDE)
     )
-    result = transfer_pose(person, person, **UPRIGHT)
+    result = transfer_pose(person, (person[0] + 0.1, person[1]), **UPRIGHT)
     said = "mesh has a shape between a person's and an animal's: name the weights of its kind if these are not"
     assert result.report.warnings == (f"the identity {said}", f"the pose {said}")
     text = str(result.report)
@@ -383,6 +383,50 @@ def test_what_is_no_body_is_neither_and_of_no_unit(kind, person):
         assert area == pytest.approx(float(_kinds.surface_area(*_kinds.rest_body("humans"))), rel=1e-3)
     given = transfer_pose(person, mesh, weights=net, pose_unit="cm", **UPRIGHT).report
     assert given.pose.scale.unit == "cm"
+
+
+LIMITS = {name: {"median": 0.0, "limit": 0.0} for name in ("identity_roughness", "pose_roughness")}
+
+
+def test_what_follows_from_a_mesh_of_no_kind_is_counted(person, mover, tmp_path, monkeypatch, capsys):
+    """Of the pose, a ball: its roughness and what is about the two; not the roughness of the identity."""
+    net = copier(data="humans", usual={**LIMITS, "edge_change": {"median": 0.0, "limit": -1.0}})
+    report = transfer_pose(person, blob("ball"), weights=net, pose_unit="m", **UPRIGHT).report
+    found = [(doubt.role, doubt.follows) for doubt in report.doubts]
+    assert found == [("pose", False), ("pose", True), ("", True), ("identity", False), ("pose", True)]
+    assert report.warnings[1].startswith("pose: far from the size of the training bodies in the unit given")
+    said = [line for line in str(report).splitlines() if line.startswith("UNUSUAL")]
+    assert len(said) == 2 and "neither a person" in said[0] and "identity mesh's surface is rough" in said[1]
+    assert "3 further doubts follow from the kind of mesh: see the report's doubts, or --report FILE" in str(report)
+    assert len(report.warnings) == 5 and len(report.as_dict()["doubts"]) == 5
+    assert not any(doubt.follows for doubt in transfer_pose(person, mover, weights=net, **UPRIGHT).report.doubts)
+    monkeypatch.setattr(choose, "load_weights", lambda *_: net)
+    save_mesh(tmp_path / "id.obj", *person)
+    save_mesh(tmp_path / "ball.obj", *blob("ball"))
+    words = [*AXES, "--weights", "copy", *QUIET]
+    command(tmp_path / "id.obj", tmp_path / "ball.obj", "-o", tmp_path / "x.obj", "--pose-unit=m", *words)
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 3 and error[2].startswith(f"unusual: {tmp_path / 'ball.obj'}: 3 further doubts follow")
+    animals = load_animals()
+    other = transfer_pose((animals.template, animals.faces), person, weights=net, **UPRIGHT).report
+    assert {doubt.follows for doubt in other.doubts if doubt.role != "pose"} == {False, True}, "the other kind, too"
+    assert not any(doubt.follows for doubt in other.doubts if doubt.role == "pose")
+
+
+def test_one_mesh_as_identity_and_pose_is_doubted_once(person):
+    net = copier(data="humans", usual=LIMITS)
+    giant = (3 * person[0], person[1])
+    units = {"identity_unit": "m", "pose_unit": "m"}
+    report = transfer_pose(giant, (giant[0].clone(), giant[1]), weights=net, **units, **UPRIGHT).report
+    assert [doubt.role for doubt in report.doubts] == ["", ""]
+    assert [text[:30] for text in report.warnings] == [
+        "far from the size of the train",
+        "the mesh's surface is rough: 0",
+    ]
+    apart = transfer_pose(giant, (giant[0] + 0.1, giant[1]), weights=net, **units, **UPRIGHT).report
+    assert [doubt.role for doubt in apart.doubts] == ["identity", "pose", "identity", "pose"]
+    ball = transfer_pose(blob("ball"), blob("ball"), weights=copier(data="humans", usual=WIDE), **UPRIGHT).report
+    assert [text[:30] for text in ball.warnings if "neither" in text] == ["the mesh has the shape of neit"]
 
 
 def test_a_mesh_of_no_unit_keeps_its_size(person):
@@ -430,7 +474,7 @@ def test_doubt_of_size_and_axes_is_a_warning(person, monkeypatch):
     assert text.startswith("identity: far from the size of the training bodies in the unit given, m: scaled by 0.3")
     for clear in (False, True):
         monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, c=clear, **__: (torch.eye(3), c))
-        report = transfer_pose(person, person, weights=net, identity_up="+z", pose_up="+z").report
+        report = transfer_pose(person, (person[0] + 0.1, person[1]), weights=net, identity_up="+z", pose_up="+z").report
         text = "pose: axes in doubt (up +z, facing -y): give them, up and facing, if they are wrong"
         assert (text in report.warnings) != clear
         assert ("all within" in str(report)) == clear

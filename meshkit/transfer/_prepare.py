@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from meshkit.io import CleanMesh, MeshReport, SimpleMesh
@@ -82,6 +83,11 @@ class Prepared:
         if self.how == _GIVEN:
             return (*found, f"the axes given ({axes}) seem wrong: leave them out to have them found")
         return (*found, f"axes in doubt ({axes}): give them, up and facing, if they are wrong")
+
+    def is_same(self, other: "Prepared") -> bool:
+        """Whether both come from the same vertices and faces, at one scale."""
+        same_faces = torch.equal(self.faces.cpu(), other.faces.cpu())
+        return same_faces and torch.equal(self.clean.original, other.clean.original)
 
     def carry(self, deformed: Tensor) -> Tensor:
         """(V, 3) all vertices of the file, from the simple ones (N, 3) deformed; in the frame of the weights."""

@@ -17,6 +17,7 @@ from torch import Tensor
 from meshkit._transfer_command import check_out, main
 from meshkit.io import atomic_write, save_mesh
 from meshkit.io.report import counted
+from meshkit.transfer._doubts import following
 from meshkit.transfer._open import Mesh
 from meshkit.transfer.output import save_page, save_picture
 from meshkit.transfer.report import TransferResult
@@ -142,8 +143,11 @@ class _Output:
         if self._count == 0 and not quiet:
             print(report)
         else:
-            for doubt in news:
-                print(f"unusual: {report.blamed(doubt)}: {doubt.text}", file=sys.stderr if quiet else sys.stdout)
+            told = [f"{report.blamed(doubt)}: {doubt.text}" for doubt in news if not doubt.follows]
+            if more := following(news):
+                told.append(f"{report.pose.name}: {more}")
+            for text in told:
+                print(f"unusual: {text}", file=sys.stderr if quiet else sys.stdout)
         if file is not None and not quiet:
             print(f"{file}: {len(result.verts)} vertices", flush=True)
 

@@ -61,7 +61,9 @@ def save_page(path: str | os.PathLike[str], result: TransferResult) -> None:
     """
     report = result.report
     meshes = dict(zip(_TITLES, _upright(result), strict=True))
-    headlines = "; ".join(doubt.headline for doubt in report.doubts)
+    headlines = "; ".join(doubt.headline for doubt in report.doubts if not doubt.follows)
+    if count := sum(doubt.follows for doubt in report.doubts):
+        headlines += f"; {count} more"
     notes = [Path(report.identity.name).name, Path(report.pose.name).name, headlines or report.weights]
     save_html(path, meshes, title="Pose transfer", notes=notes)
 
