@@ -50,6 +50,7 @@ from meshkit.transfer import (
 from meshkit.transfer._frames import axis_name, axis_vector, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import Likeness, guess_kind
 from meshkit.transfer._open import named, open_mesh
+from meshkit.transfer._orient import RestBody
 from meshkit.transfer._units import UNITS, find_scale, scale_to
 from meshkit.transfer.confidence import roughness, row_entropies
 from meshkit.transfer.report import Doubt
@@ -75,6 +76,12 @@ class Copy(nn.Module):
 
 def copier(**card) -> PretrainedTransfer:
     return PretrainedTransfer(Copy(), GeneratorConfig(k=1), card={"name": "copy", **card}).eval()  # type: ignore[arg-type]
+
+
+def pretend_matching(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let weights pass for ones with a matching, where ``find_rotation``, which would match, is replaced."""
+    monkeypatch.setattr(RestBody, "can_match", True)
+    monkeypatch.setattr("meshkit.transfer._prepare.agrees", lambda *_, **__: True)
 
 
 def body_of(resolution: int, identity: int, pose: int) -> Mesh:
@@ -658,6 +665,15 @@ def test_a_sequence_is_as_its_poses_one_by_one(person, moves):
     assert float(torch.cdist(simple.verts, poses[2][0]).amin(1).max()) < 0.05
 
 
+def test_the_roughness_of_the_identity_is_measured_once(person, moves, monkeypatch):
+    sizes = []
+    monkeypatch.setattr("meshkit.transfer._prepare.roughness", lambda verts, faces: sizes.append(verts) or 0.1)
+    monkeypatch.setattr("meshkit.transfer.confidence.roughness", lambda *_: pytest.fail("measured again"))
+    poses = [(v, moves[1]) for v in moves[0]]
+    results = list(transfer_sequence(person, poses, weights=copier(), **UPRIGHT))
+    assert len(sizes) == 4 and results[2].report.confidence.identity_roughness == 0.1
+
+
 def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
     looked = []
     monkeypatch.setattr(
@@ -675,7 +691,7 @@ def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
 )
 def test_an_axis_that_was_given_holds_for_every_pose(given, count, person, moves, monkeypatch):
     net = copier(data="humans", usual=WIDE)
-    net.generator.match = None
+    pretend_matching(monkeypatch)
     asked = []
 
     def find(*_, candidates, **__):
@@ -695,7 +711,7 @@ def test_an_axis_that_was_given_holds_for_every_pose(given, count, person, moves
 
 def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatch):
     net = copier(data="humans", usual=WIDE)
-    net.generator.match = None  # find_rotation, which would call it, is replaced
+    pretend_matching(monkeypatch)
     monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, **__: (torch.eye(3), True))
     clear = iter((False, True))
     monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), next(clear)))
@@ -709,7 +725,7 @@ def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatc
 
 def test_doubt_about_the_first_poses_axes_is_not_said_of_later_ones(person, moves, monkeypatch):
     net = copier(data="humans", usual=WIDE)
-    net.generator.match = None
+    pretend_matching(monkeypatch)
     monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, **__: (torch.eye(3), False))
     monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), True))
     axes = {name: axis for name, axis in UPRIGHT.items() if name != "pose_facing"}

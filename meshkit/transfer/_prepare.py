@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from meshkit.transfer._kinds import Likeness, rest_body, surface_area
 from meshkit.transfer._open import OpenedMesh, named
 from meshkit.transfer._orient import RestBody, agrees, find_rotation
 from meshkit.transfer._units import UNITS, Scale, find_scale, scale_to
+from meshkit.transfer.confidence import roughness
 
 __all__ = ["Prepared", "prepare"]
 
@@ -62,6 +64,11 @@ class Prepared:
     def verts(self) -> Tensor:
         """(N, 3) simple vertices in the frame of the weights."""
         return self.simple.verts @ self.rotation.T
+
+    @cached_property
+    def roughness(self) -> float:
+        """:func:`~meshkit.transfer.confidence.roughness` of the simple mesh."""
+        return roughness(self.simple.verts, self.simple.faces)
 
     @property
     def up(self) -> Tensor:

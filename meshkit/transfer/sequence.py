@@ -292,7 +292,7 @@ class _Follower:
         simple = replace(first.simple, verts=small, original=clean.verts)
         descriptors = named(name, lambda: transfer.net.describe(small, simple.faces))
         rotation, clear, rest = before.rotation, before.clear, transfer.rest
-        if len(self._allowed) > 1 and rest is not None and hasattr(transfer.net.generator, "match"):
+        if len(self._allowed) > 1 and rest is not None and rest.can_match:
             rotation, clear = named(
                 name,
                 lambda: find_rotation(

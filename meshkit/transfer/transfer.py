@@ -191,12 +191,21 @@ class PoseTransfer:
 def run_network(net: PretrainedTransfer, identity: Prepared, pose: Prepared) -> tuple[GeneratorOutput, Confidence]:
     """What the weights make of two prepared meshes, and the numbers of it."""
     pair = identity.verts, pose.verts
-    faces = {"identity_faces": identity.simple.faces, "pose_faces": pose.simple.faces}
+    faces: dict[str, Any] = {"identity_faces": identity.simple.faces, "pose_faces": pose.simple.faces}
     one, two = identity.descriptors, pose.descriptors
     dtype = next(net.parameters()).dtype
     first, second = (None if described is None else described.to(dtype) for described in (one, two))
     output = net.output(*pair, **faces, identity_descriptors=first, pose_descriptors=second)
-    numbers = measure_confidence(net, *pair, **faces, output=output, identity_descriptors=one, pose_descriptors=two)
+    numbers = measure_confidence(
+        net,
+        *pair,
+        **faces,
+        output=output,
+        identity_descriptors=one,
+        pose_descriptors=two,
+        identity_roughness=identity.roughness,
+        pose_roughness=pose.roughness,
+    )
     return output, numbers
 
 
