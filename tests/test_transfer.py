@@ -50,6 +50,7 @@ from meshkit.transfer import (
 from meshkit.transfer._frames import axis_name, axis_vector, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import Likeness, guess_kind
 from meshkit.transfer._open import named, open_mesh
+from meshkit.transfer._openings import find_openings, opening_lengths
 from meshkit.transfer._orient import RestBody
 from meshkit.transfer._units import UNITS, find_scale, scale_to
 from meshkit.transfer.confidence import roughness, row_entropies
@@ -1158,9 +1159,74 @@ def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, mon
 def test_one_hole_is_a_hole(person, mover):
     verts, faces = person
     report = transfer_pose((verts, faces[1:]), mover, weights=copier(), **UPRIGHT).report
-    assert "1 hole (3 boundary edges)" in str(report) and "the surface is open (1 hole)" in str(report)
+    assert "1 hole (3 boundary edges)" in str(report) and "the surface is open (1 hole, the longest 0." in str(report)
     many = transfer_pose((verts, faces[1:-1]), mover, weights=copier(), **UPRIGHT).report
     assert "2 holes (6 boundary edges)" in str(many)
+
+
+def without(kind: str, joint: int, who: int = 0) -> Mesh:
+    """A shipped body without what hangs on a joint."""
+    body, split = load_shipped(kind)
+    cut, parents = {joint}, body.parents.tolist()
+    for child in range(joint, len(parents)):
+        cut |= {child} if parents[child] in cut else set()
+    gone = body.weights[:, sorted(cut)].sum(1) > 0.5
+    place = split.test_identities[who : who + 1], split.test_poses[:1]
+    return body(*place)[0], body.faces[~gone[body.faces].any(1)]
+
+
+def test_openings_are_measured():
+    ring = trimesh.creation.cylinder(1.0, 2.0, sections=64)
+    lids = np.abs(ring.face_normals[:, 2]) > 0.5
+    tube = torch.tensor(ring.vertices).float(), torch.tensor(ring.faces[~lids])
+    around = 64 * 2 * math.sin(math.pi / 64)
+    assert_near(opening_lengths(*tube), torch.tensor([around, around]).double(), 1e-5)
+    found = find_openings(*tube)
+    assert found.loops == 2 and found.longest == pytest.approx(around / math.sqrt(2 * around), rel=1e-5)
+    assert "2 boundary loops, the longest 1.77 times" in found.doubt
+    assert find_openings(10 * tube[0], tube[1]).longest == pytest.approx(found.longest, rel=1e-5)
+    closed = find_openings(torch.tensor(ring.vertices), torch.tensor(ring.faces))
+    assert closed == (0, 0.0) and closed.doubt == ""
+
+
+def test_a_wrong_unit_changes_neither_kind_nor_roughness_nor_openings(person):
+    """So the warnings about these have no reason to speak of units."""
+    mesh = without("humans", 24)
+    found = []
+    for factor, unit in ((1.0, None), (1.0, "cm"), (1.0, "ft"), (1000.0, "m"), (0.0254, "in")):
+        options = {"weights": copier(data="humans", usual=WIDE), "pose_unit": unit, **UPRIGHT}
+        report = transfer_pose(person, (factor * mesh[0], mesh[1]), **options).report
+        assert any("far from the size" in text for text in report.warnings) == (unit is not None)
+        pose = report.pose
+        found.append([pose.likeness.score, pose.likeness.distance, pose.roughness, pose.openings.longest])
+    assert_near(torch.tensor(found), torch.tensor(found[:1]).expand(5, 4), 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "joint"), [("humans", 24), ("humans", 5), ("humans", 71), ("animals", 14), ("animals", 29)]
+)
+def test_what_is_cut_off_is_noticed(kind, joint):
+    """A hand, a foot, the head; a fore paw and a hind foot."""
+    for who in (0, 1):
+        assert "give the whole body" in find_openings(*without(kind, joint, who)).doubt
+    body = load_shipped(kind)[0]
+    assert find_openings(body.template, body.faces) == (0, 0.0)
+
+
+def test_an_open_mesh_is_in_doubt(mover):
+    """Whatever its kind; a hole of one face is not, nor are seams of the file, which are welded."""
+    verts, faces = without("humans", 71)
+    report = transfer_pose((verts, faces), mover, weights=copier(data="humans", usual=WIDE), **UPRIGHT).report
+    (said,) = [text for text in report.warnings if "open" in text]
+    assert said.startswith("the identity mesh is open: 1 boundary loop, the longest 0.3")
+    assert report.as_dict()["identity"]["openings"]["loops"] == 1
+    body = load_humans()
+    net = copier(data="humans", usual=WIDE)
+    soup = body.template[body.faces].reshape(-1, 3)
+    seams = soup, torch.arange(len(soup)).reshape(-1, 3)
+    for mesh, is_open in (((body.template, body.faces[1:]), True), (seams, False)):
+        report = transfer_pose(mesh, mover, weights=net, **UPRIGHT).report
+        assert report.warnings == () and ("the surface is open" in str(report)) == is_open
 
 
 def test_no_results_are_no_picture(tmp_path):

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from meshkit.io import CleanMesh, MeshReport, SimpleMesh
-from meshkit.io.report import counted
 from meshkit.models import PretrainedTransfer
 from meshkit.transfer._frames import axis_name, rotations
 from meshkit.transfer._kinds import Likeness, rest_body, surface_area
 from meshkit.transfer._open import OpenedMesh, named
+from meshkit.transfer._openings import Openings, find_openings
 from meshkit.transfer._orient import RestBody, agrees, find_rotation
 from meshkit.transfer._units import UNITS, Scale, find_scale, scale_to
 from meshkit.transfer.confidence import roughness
@@ -36,6 +36,7 @@ class Prepared:
         how: what ``rotation`` rests on.
         clear: whether ``rotation`` is beyond doubt.
         likeness: the kind of body that it is like; ``None`` if the weights do not say what they are for.
+        openings: holes of the clean surface; in a sequence, of the first mesh with these faces.
         notes: what was done or should be known.
     """
 
@@ -48,6 +49,7 @@ class Prepared:
     how: str
     clear: bool
     likeness: Likeness | None
+    openings: Openings
     notes: tuple[str, ...]
 
     @property
@@ -159,13 +161,14 @@ def prepare(
         notes += (f"simplified to {len(simple.verts)} vertices",)
     elif len(simple.verts) < 0.8 * num_verts:
         notes += (f"only {len(simple.verts)} vertices; the weights are used to {num_verts}",)
-    if report.boundary_edges:
-        notes += (f"the surface is open ({counted(report.boundary_loops, 'hole')}), which the weights have not seen",)
+    openings = named(name, lambda: find_openings(clean.verts, clean.faces))  # not of the seams that were welded
+    if openings.loops:
+        notes += (f"the surface is open ({openings}), which the weights have not seen",)
     descriptors = named(name, lambda: net.describe(simple.verts, simple.faces))
     rest = rest or (None if kind is None else RestBody(net, kind))
     rotation, how, clear = named(name, lambda: _rotation(report, simple, descriptors, rest, up, facing))
     rotation = rotation.to(metric.verts)
-    return Prepared(opened, metric, simple, descriptors, scale, rotation, how, clear, likeness, notes)
+    return Prepared(opened, metric, simple, descriptors, scale, rotation, how, clear, likeness, openings, notes)
 
 
 def _scale(opened: OpenedMesh, kind: str | None, likeness: Likeness | None, unit: str | None) -> Scale:

@@ -118,6 +118,7 @@ def _facts(mesh: Prepared) -> dict[str, Any]:
         "up": axis_name(mesh.up),
         "facing": axis_name(-mesh.rotation[1]),
         "axes": mesh.found,
+        "openings": mesh.openings._asdict(),
         "done": list(mesh.notes),
     }
 
