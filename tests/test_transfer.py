@@ -1159,7 +1159,7 @@ def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, mon
 def test_one_hole_is_a_hole(person, mover):
     verts, faces = person
     report = transfer_pose((verts, faces[1:]), mover, weights=copier(), **UPRIGHT).report
-    assert "1 hole (3 boundary edges)" in str(report) and "the surface is open (1 hole, the longest 0." in str(report)
+    assert "1 hole (3 boundary edges)" in str(report) and "the surface is open (1 hole, longest loop 0." in str(report)
     many = transfer_pose((verts, faces[1:-1]), mover, weights=copier(), **UPRIGHT).report
     assert "2 holes (6 boundary edges)" in str(many)
 

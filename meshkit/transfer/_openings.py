@@ -42,7 +42,7 @@ class Openings(NamedTuple):
         )
 
     def __str__(self) -> str:
-        return f"{counted(self.loops, 'hole')}, the longest {self.longest:.2g} times the square root of the area around"
+        return f"{counted(self.loops, 'hole')}, longest loop {self.longest:.2g} times the square root of the area"
 
 
 def find_openings(verts: Tensor, faces: Tensor) -> Openings:
