@@ -6,7 +6,7 @@
 The same as the console script meshkit-transfer; --help lists the options, docs/transfer.md explains them.
 """
 
-from meshkit.transfer.command import main
+from meshkit._transfer_command import main
 
 if __name__ == "__main__":
     main()

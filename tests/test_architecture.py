@@ -38,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "viz": {"io"},
     "data": FOUNDATION | {"io", "descriptors"},
 }
+MAY_IMPORT["_transfer_command"] = {"models", "transfer"}  # inside functions: it checks options without PyTorch
 MAY_IMPORT["transfer"] = set(MAY_IMPORT)
 
 # Third-party packages importable at module level; everything else is imported inside the function that needs it.

@@ -4,13 +4,16 @@
 transfer must be a rigid motion of the identity mesh into the frame and place of the pose mesh.
 """
 
+import gc
 import itertools
 import json
 import math
 import os
 import re
 import struct
+import subprocess
 import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +24,9 @@ import trimesh
 from conftest import assert_near
 from torch import Tensor, nn
 
+import meshkit._transfer_command as front
 import meshkit.transfer._choose as choose
+from meshkit._transfer_command import main, parser
 from meshkit.batching import center
 from meshkit.data import load_animals, load_humans, load_shipped
 from meshkit.io import MeshFileError, load_mesh, save_mesh
@@ -32,10 +37,12 @@ from meshkit.topology import vertex_normals
 from meshkit.transfer import (
     Confidence,
     PoseTransfer,
+    UnusablePosesError,
     _kinds,
     read_sequence,
     save_page,
     save_picture,
+    sequence,
     transfer_pose,
     transfer_sequence,
     usual_range,
@@ -43,8 +50,9 @@ from meshkit.transfer import (
 from meshkit.transfer._frames import axis_name, axis_vector, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import Likeness, guess_kind
 from meshkit.transfer._open import named, open_mesh
-from meshkit.transfer._units import find_scale, scale_to
-from meshkit.transfer.command import main, parser
+from meshkit.transfer._openings import find_openings, opening_lengths
+from meshkit.transfer._orient import RestBody
+from meshkit.transfer._units import UNITS, find_scale, scale_to
 from meshkit.transfer.confidence import roughness, row_entropies
 from meshkit.transfer.report import Doubt
 
@@ -69,6 +77,12 @@ class Copy(nn.Module):
 
 def copier(**card) -> PretrainedTransfer:
     return PretrainedTransfer(Copy(), GeneratorConfig(k=1), card={"name": "copy", **card}).eval()  # type: ignore[arg-type]
+
+
+def pretend_matching(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let weights pass for ones with a matching, where ``find_rotation``, which would match, is replaced."""
+    monkeypatch.setattr(RestBody, "can_match", True)
+    monkeypatch.setattr("meshkit.transfer._prepare.agrees", lambda *_, **__: True)
 
 
 def body_of(resolution: int, identity: int, pose: int) -> Mesh:
@@ -336,7 +350,7 @@ def test_a_shape_between_the_kinds_is_taken_for_a_person_in_doubt(person, monkey
     monkeypatch.setattr(
         choose, "load_pretrained", lambda name: copier(name=name, data=cards[name], figures={"pmd": 1.0}, usual=WIDE)
     )
-    result = transfer_pose(person, person, **UPRIGHT)
+    result = transfer_pose(person, (person[0] + 0.1, person[1]), **UPRIGHT)
     said = "mesh has a shape between a person's and an animal's: name the weights of its kind if these are not"
     assert result.report.warnings == (f"the identity {said}", f"the pose {said}")
     text = str(result.report)
@@ -377,6 +391,50 @@ def test_what_is_no_body_is_neither_and_of_no_unit(kind, person):
         assert area == pytest.approx(float(_kinds.surface_area(*_kinds.rest_body("humans"))), rel=1e-3)
     given = transfer_pose(person, mesh, weights=net, pose_unit="cm", **UPRIGHT).report
     assert given.pose.scale.unit == "cm"
+
+
+LIMITS = {name: {"median": 0.0, "limit": 0.0} for name in ("identity_roughness", "pose_roughness")}
+
+
+def test_what_follows_from_a_mesh_of_no_kind_is_counted(person, mover, tmp_path, monkeypatch, capsys):
+    """Of the pose, a ball: its roughness and what is about the two; not the roughness of the identity."""
+    net = copier(data="humans", usual={**LIMITS, "edge_change": {"median": 0.0, "limit": -1.0}})
+    report = transfer_pose(person, blob("ball"), weights=net, pose_unit="m", **UPRIGHT).report
+    found = [(doubt.role, doubt.follows) for doubt in report.doubts]
+    assert found == [("pose", False), ("pose", True), ("", True), ("identity", False), ("pose", True)]
+    assert report.warnings[1].startswith("pose: far from the size of the training bodies in the unit given")
+    said = [line for line in str(report).splitlines() if line.startswith("UNUSUAL")]
+    assert len(said) == 2 and "neither a person" in said[0] and "identity mesh's surface is rough" in said[1]
+    assert "3 further doubts follow from the kind of mesh: see the report's doubts, or --report FILE" in str(report)
+    assert len(report.warnings) == 5 and len(report.as_dict()["doubts"]) == 5
+    assert not any(doubt.follows for doubt in transfer_pose(person, mover, weights=net, **UPRIGHT).report.doubts)
+    monkeypatch.setattr(choose, "load_weights", lambda *_: net)
+    save_mesh(tmp_path / "id.obj", *person)
+    save_mesh(tmp_path / "ball.obj", *blob("ball"))
+    words = [*AXES, "--weights", "copy", *QUIET]
+    command(tmp_path / "id.obj", tmp_path / "ball.obj", "-o", tmp_path / "x.obj", "--pose-unit=m", *words)
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 3 and error[2].startswith(f"unusual: {tmp_path / 'ball.obj'}: 3 further doubts follow")
+    animals = load_animals()
+    other = transfer_pose((animals.template, animals.faces), person, weights=net, **UPRIGHT).report
+    assert {doubt.follows for doubt in other.doubts if doubt.role != "pose"} == {False, True}, "the other kind, too"
+    assert not any(doubt.follows for doubt in other.doubts if doubt.role == "pose")
+
+
+def test_one_mesh_as_identity_and_pose_is_doubted_once(person):
+    net = copier(data="humans", usual=LIMITS)
+    giant = (3 * person[0], person[1])
+    units = {"identity_unit": "m", "pose_unit": "m"}
+    report = transfer_pose(giant, (giant[0].clone(), giant[1]), weights=net, **units, **UPRIGHT).report
+    assert [doubt.role for doubt in report.doubts] == ["", ""]
+    assert [text[:30] for text in report.warnings] == [
+        "far from the size of the train",
+        "the mesh's surface is rough: 0",
+    ]
+    apart = transfer_pose(giant, (giant[0] + 0.1, giant[1]), weights=net, **units, **UPRIGHT).report
+    assert [doubt.role for doubt in apart.doubts] == ["identity", "pose", "identity", "pose"]
+    ball = transfer_pose(blob("ball"), blob("ball"), weights=copier(data="humans", usual=WIDE), **UPRIGHT).report
+    assert [text[:30] for text in ball.warnings if "neither" in text] == ["the mesh has the shape of neit"]
 
 
 def test_a_mesh_of_no_unit_keeps_its_size(person):
@@ -424,7 +482,7 @@ def test_doubt_of_size_and_axes_is_a_warning(person, monkeypatch):
     assert text.startswith("identity: far from the size of the training bodies in the unit given, m: scaled by 0.3")
     for clear in (False, True):
         monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, c=clear, **__: (torch.eye(3), c))
-        report = transfer_pose(person, person, weights=net, identity_up="+z", pose_up="+z").report
+        report = transfer_pose(person, (person[0] + 0.1, person[1]), weights=net, identity_up="+z", pose_up="+z").report
         text = "pose: axes in doubt (up +z, facing -y): give them, up and facing, if they are wrong"
         assert (text in report.warnings) != clear
         assert ("all within" in str(report)) == clear
@@ -608,6 +666,15 @@ def test_a_sequence_is_as_its_poses_one_by_one(person, moves):
     assert float(torch.cdist(simple.verts, poses[2][0]).amin(1).max()) < 0.05
 
 
+def test_the_roughness_of_the_identity_is_measured_once(person, moves, monkeypatch):
+    sizes = []
+    monkeypatch.setattr("meshkit.transfer._prepare.roughness", lambda verts, faces: sizes.append(verts) or 0.1)
+    monkeypatch.setattr("meshkit.transfer.confidence.roughness", lambda *_: pytest.fail("measured again"))
+    poses = [(v, moves[1]) for v in moves[0]]
+    results = list(transfer_sequence(person, poses, weights=copier(), **UPRIGHT))
+    assert len(sizes) == 4 and results[2].report.confidence.identity_roughness == 0.1
+
+
 def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
     looked = []
     monkeypatch.setattr(
@@ -625,7 +692,7 @@ def test_the_kind_of_a_sequence_is_looked_at_once(person, moves, monkeypatch):
 )
 def test_an_axis_that_was_given_holds_for_every_pose(given, count, person, moves, monkeypatch):
     net = copier(data="humans", usual=WIDE)
-    net.generator.match = None
+    pretend_matching(monkeypatch)
     asked = []
 
     def find(*_, candidates, **__):
@@ -645,7 +712,7 @@ def test_an_axis_that_was_given_holds_for_every_pose(given, count, person, moves
 
 def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatch):
     net = copier(data="humans", usual=WIDE)
-    net.generator.match = None  # find_rotation, which would call it, is replaced
+    pretend_matching(monkeypatch)
     monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, **__: (torch.eye(3), True))
     clear = iter((False, True))
     monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), next(clear)))
@@ -659,7 +726,7 @@ def test_a_later_pose_whose_axes_are_in_doubt_is_named(person, moves, monkeypatc
 
 def test_doubt_about_the_first_poses_axes_is_not_said_of_later_ones(person, moves, monkeypatch):
     net = copier(data="humans", usual=WIDE)
-    net.generator.match = None
+    pretend_matching(monkeypatch)
     monkeypatch.setattr("meshkit.transfer._prepare.find_rotation", lambda *_, **__: (torch.eye(3), False))
     monkeypatch.setattr("meshkit.transfer.sequence.find_rotation", lambda *_, **__: (torch.eye(3), True))
     axes = {name: axis for name, axis in UPRIGHT.items() if name != "pose_facing"}
@@ -745,6 +812,63 @@ def test_what_the_reader_says_of_the_first_pose_is_kept(person, moves, tmp_path)
     assert "split into triangles" in alone[0] and result.report.pose.notes == alone
 
 
+@pytest.fixture
+def poses_some_bad(moves, tmp_path) -> Path:
+    """A folder of six poses: 1 is text, 2 has a vertex that is none, 4 is flat: it follows the faces of 0."""
+    verts, faces = moves
+    folder = tmp_path / "poses"
+    for number, place in ((0, 0), (2, 1), (3, 1), (5, 2)):
+        save_mesh(folder / f"p_{number}.obj", verts[place], faces)
+    (folder / "p_1.obj").write_text("f 1 2\n")
+    text = (folder / "p_2.obj").read_text().splitlines()
+    (folder / "p_2.obj").write_text("\n".join(["v nan 0 0", *text[1:]]))
+    (folder / "p_4.obj").write_text(re.sub("v .*", "v 1 1 1", (folder / "p_0.obj").read_text()))
+    return folder
+
+
+def test_all_bad_poses_are_listed_before_the_first_transfer(person, poses_some_bad, monkeypatch):
+    made = []
+    monkeypatch.setattr(PoseTransfer, "apply", lambda *_, **__: made.append(1))
+    with pytest.raises(UnusablePosesError, match=r"3 of 6 poses cannot be used.*skip_bad") as caught:
+        next(transfer_sequence(person, poses_some_bad, weights=copier(), **UPRIGHT))
+    assert not made and len(caught.value.reasons) == 3
+    names = [str(poses_some_bad / f"p_{number}.obj") for number in (1, 2, 4)]
+    assert all(reason.startswith(name) for reason, name in zip(caught.value.reasons, names, strict=True))
+    assert "no surface area" in caught.value.reasons[2]
+    assert str(caught.value).splitlines()[1:] == [f"  {reason}" for reason in caught.value.reasons]
+
+
+def test_bad_poses_are_left_out_and_told(person, moves, poses_some_bad):
+    options = {"weights": copier(), "skip_bad": True, **UPRIGHT}
+    with pytest.warns(UserWarning, match="3 of 6 poses are left out") as caught:
+        results = list(transfer_sequence(person, poses_some_bad, **options))
+    assert [Path(result.report.pose.name).name for result in results] == ["p_0.obj", "p_3.obj", "p_5.obj"]
+    assert len(caught) == 1 and all(f"p_{number}.obj" in str(caught[0].message) for number in (1, 2, 4))
+    with pytest.warns(UserWarning, match=r"a pose is left out: .*p_\d\.obj") as caught:  # as they come
+        later = list(transfer_sequence(person, iter(read_sequence(poses_some_bad)), **options))
+    assert len(caught) == 3
+    assert_near(torch.stack([r.verts for r in later]), torch.stack([r.verts for r in results]), 1e-6)
+    for number in (0, 3, 5):
+        (poses_some_bad / f"p_{number}.obj").unlink()
+    with pytest.raises(UnusablePosesError, match="3 of 3 poses cannot be used; there is nothing to transfer"):
+        next(transfer_sequence(person, poses_some_bad, **options))
+
+
+def test_checking_poses_keeps_none_of_them(person, moves, tmp_path, monkeypatch):
+    alive: list[weakref.ref] = []
+
+    def load(path):
+        gc.collect()
+        assert sum(ref() is not None for ref in alive) <= 1, "the one before, until it is replaced"
+        verts = moves[0][int(path.stem)].clone()
+        alive.append(weakref.ref(verts))
+        return verts, moves[1]
+
+    monkeypatch.setattr("meshkit.transfer._open.load_mesh", load)
+    check = sequence._Check()
+    assert [check(number, tmp_path / f"{number % 3}.obj") for number in range(6)] == [None] * 6
+
+
 def test_a_broken_pose_in_a_sequence_is_named(person, moves):
     verts = moves[0].clone()
     verts[1, 7] = math.nan
@@ -768,6 +892,11 @@ def command(*words: object) -> None:
         (["id.obj", "id.obj", "-o", "x.txt"], "the result is written as .obj"),
         (["id.obj", "id.obj", "-o", "x.npz"], "the result is written as .obj"),
         (["id.obj", "id.obj", "-o", "id.obj"], "would overwrite an input"),
+        (["id.obj", "id.obj", "-o", "out.obj", "--report", "id.obj"], "would overwrite an input"),
+        (["folder", "id.obj"], "folder: a folder; the identity is one mesh"),
+        (["id.obj", "id.obj", "--refine", "-1"], "--refine must be a positive weight, got -1"),
+        (["id.obj", "id.obj", "--refine", "1", "--no-refine"], "exclude each other"),
+        (["id.obj", "id.obj", "--pose-up", "+z", "--pose-facing", "-z"], "--pose-facing -z must be at right angles"),
         (["id.obj", "id.obj", "--weights", "none"], "weights must be 'auto'"),
         (["bad.obj", "id.obj"], "bad.obj: not a readable OBJ mesh"),
     ],
@@ -776,6 +905,7 @@ def test_mistakes_are_one_line_and_status_2(words, message, person, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     save_mesh("id.obj", *person)
     Path("bad.obj").write_text("f 1 2\n")
+    Path("folder").mkdir()
     with pytest.raises(SystemExit) as caught:
         command(*words)
     assert caught.value.code == 2
@@ -788,7 +918,8 @@ def test_mistakes_are_one_line_and_status_2(words, message, person, tmp_path, mo
     [
         ["id.obj", "poses", "-o", "poses/pose.obj"],
         ["id.obj", "poses", "-o", "elsewhere/../poses/new.obj"],
-        ["out_0000.obj", "poses", "-o", "out.obj"],
+        ["out_pose_0001.obj", "poses", "-o", "out.obj"],
+        ["id.obj", "poses", "-o", "out.npz", "--report", "poses/pose_0000.obj"],
         ["id.obj", "moves_0000.glb", "-o", "moves.glb"],
     ],
 )
@@ -796,7 +927,7 @@ def test_many_results_never_overwrite_an_input(words, person, moves, tmp_path, m
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
     Path("elsewhere").mkdir()
-    for name in ("id.obj", "out_0000.obj"):
+    for name in ("id.obj", "out_pose_0001.obj"):
         save_mesh(name, *person)
     scene = trimesh.Scene()
     for number, frame in enumerate(moves[0]):
@@ -810,6 +941,95 @@ def test_many_results_never_overwrite_an_input(words, person, moves, tmp_path, m
     error = capsys.readouterr().err
     assert caught.value.code == 2 and error.count("\n") == 1 and "overwrite" in error
     assert {path: path.read_bytes() for path in sorted(tmp_path.rglob("*.*"))} == before
+
+
+QUIET = ["--no-picture", "--no-html", "--quiet"]
+AXES = [f"--{name.replace('_', '-')}={axis}" for name, axis in UPRIGHT.items()]
+
+
+def test_results_are_named_after_the_files_of_their_poses(person, moves, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
+    save_mesh(tmp_path / "id.obj", *person)
+    sources = ("jump.obj", "p10.obj", "p9.obj", "p9.ply")
+    for name, frame in zip(sources, moves[0][[0, 1, 2, 2]], strict=True):
+        save_mesh(tmp_path / "poses" / name, frame, moves[1])
+    words = [tmp_path / "id.obj", tmp_path / "poses", *AXES, "--weights", "copy", *QUIET]
+    command(*words, "-o", tmp_path / "r" / "out.obj", "--report", tmp_path / "report.json")
+    named = ("out_jump.obj", "out_p9_obj.obj", "out_p9_ply.obj", "out_p10.obj")  # in the order of the poses
+    assert sorted(os.listdir(tmp_path / "r")) == sorted(named)
+    reports = json.loads((tmp_path / "report.json").read_text())
+    assert [Path(report["file"]).name for report in reports] == list(named)
+    assert reports[0]["numbers"]["edge_change"] == pytest.approx(0, abs=1e-5)
+    assert (reports[3]["pose"]["up"], reports[3]["pose"]["vertices"], reports[3]["doubts"]) == ("+z", 2000, [])
+    command(*words, "-o", tmp_path / "out.npz")
+    with np.load(tmp_path / "out.npz") as archive:
+        assert archive["names"].tolist() == ["jump.obj", "p9.obj", "p9.ply", "p10.obj"]
+        last = torch.from_numpy(archive["verts"][3])
+    assert torch.equal(load_mesh(tmp_path / "r" / "out_p10.obj")[0], last)
+    save_mesh(tmp_path / "poses" / "p9_obj.stl", moves[0][0], moves[1])
+    with pytest.raises(SystemExit):
+        command(*words, "-o", tmp_path / "r" / "out.obj")
+    assert "would have one name, p9_obj: rename one of them" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".npz"])
+def test_the_command_leaves_out_bad_poses(suffix, person, poses_some_bad, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
+    save_mesh(tmp_path / "id.obj", *person)
+    out = tmp_path / "r" / f"out{suffix}"
+    words = [tmp_path / "id.obj", poses_some_bad, *AXES, "--weights", "copy", *QUIET, "-o", out]
+    with pytest.raises(SystemExit):
+        command(*words)
+    error = capsys.readouterr().err
+    assert error.startswith("error: 3 of 6 poses cannot be used;") and "--skip-bad" in error
+    assert [Path(line.split(":")[0]).name for line in error.splitlines()[1:]] == ["p_1.obj", "p_2.obj", "p_4.obj"]
+    assert not out.parent.exists()
+    command(*words, "--skip-bad")
+    error = capsys.readouterr().err
+    assert error.startswith("warning: 3 of 6 poses are left out:\n  ") and len(error.splitlines()) == 4
+    if suffix == ".obj":
+        assert sorted(os.listdir(out.parent)) == ["out_p_0.obj", "out_p_3.obj", "out_p_5.obj"]
+    else:
+        with np.load(out) as archive:
+            assert archive["names"].tolist() == ["p_0.obj", "p_3.obj", "p_5.obj"] and len(archive["verts"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("suffix", "kept"), [(".obj", "2 files, {}_a.obj to {}_b.obj"), (".npz", "1 file, {}_partial.npz")]
+)
+@pytest.mark.parametrize("error", [ValueError("odd"), KeyboardInterrupt()])
+def test_what_is_kept_after_an_error_is_told(suffix, kept, error, person, moves, tmp_path, monkeypatch, capsys):
+    apply, count = PoseTransfer.apply, itertools.count()
+    monkeypatch.setattr(PoseTransfer, "apply", lambda *a, **o: apply(*a, **o) if next(count) < 2 else _raise(error))
+    monkeypatch.setattr(choose, "load_weights", lambda *_: copier(data=None))
+    save_mesh(tmp_path / "id.obj", *person)
+    for name, frame in zip("abc", moves[0], strict=True):
+        save_mesh(tmp_path / "poses" / f"{name}.obj", frame, moves[1])
+    out = tmp_path / "r" / f"out{suffix}"
+    with pytest.raises(SystemExit) as caught:
+        command(tmp_path / "id.obj", tmp_path / "poses", *AXES, "--weights", "copy", *QUIET, "-o", out)
+    assert caught.value.code == (2 if isinstance(error, ValueError) else 130)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == f"error: {'odd' if isinstance(error, ValueError) else 'interrupted'}"
+    assert second == f"kept: {kept.replace('{}', str(out.with_suffix('')))}"
+    assert len(os.listdir(out.parent)) == (2 if suffix == ".obj" else 1)
+    if suffix == ".npz":
+        with np.load(tmp_path / "r" / "out_partial.npz") as archive:
+            assert archive["verts"].shape == (2, 1000, 3)
+
+
+def test_mistakes_are_found_before_pytorch_is_imported(tmp_path):
+    code = (
+        "import sys\nfrom meshkit._transfer_command import main\n"
+        "try: main(sys.argv[1:])\nexcept SystemExit as end: sys.exit(end.code + ('torch' in sys.modules))"
+    )
+    for words in (["none.obj", "x.obj"], [tmp_path, tmp_path, "--refine", "-1"], ["a", "b", "--frame", "c"]):
+        done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True)
+        assert done.returncode == 2 and done.stderr.startswith("error: "), done.stderr
+
+
+def test_the_commands_units_are_those_of_the_package():
+    assert tuple(UNITS) == front.UNITS
 
 
 def test_a_device_without_memory_is_one_line(person, tmp_path, monkeypatch, capsys):
@@ -831,7 +1051,7 @@ def test_any_kind_of_value_error_gets_the_meshs_name():
         named("pose", lambda: _raise(MeshFileError("m.obj: damaged")))
 
 
-def _raise(error: Exception) -> None:
+def _raise(error: BaseException) -> None:
     raise error
 
 
@@ -903,8 +1123,9 @@ def test_the_command_takes_sequences(person, moves, tmp_path, monkeypatch, capsy
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize(("count", "said"), [(0, ""), (1, "1 warning: see"), (2, "2 warnings: see")])
-def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("count", "said"), [(0, ""), (1, "1 warning"), (2, "2 warnings")])
+@pytest.mark.parametrize("saved", [None, "r/numbers.json"])
+def test_the_caption_counts_the_warnings(count, said, saved, person, tmp_path, monkeypatch):
     from PIL import Image
 
     seen = []
@@ -916,8 +1137,8 @@ def test_the_caption_counts_the_warnings(count, said, person, tmp_path, monkeypa
     monkeypatch.setattr("meshkit.transfer.output.contact_sheet", sheet)
     result = transfer_pose(person, person, weights=copier(), **UPRIGHT)
     report = replace(result.report, doubts=(Doubt("", "odd"),) * count)
-    save_picture(tmp_path / "x.png", [replace(result, report=report)], size=20)
-    assert seen[0][2] == (f"{said} the report" if said else "")
+    save_picture(tmp_path / "x.png", [replace(result, report=report)], size=20, report=saved)
+    assert seen[0][2] == (f"{said}: see numbers.json" if said and saved else said)
 
 
 def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, monkeypatch):
@@ -938,9 +1159,74 @@ def test_the_page_has_the_headlines_of_the_warnings(person, mover, tmp_path, mon
 def test_one_hole_is_a_hole(person, mover):
     verts, faces = person
     report = transfer_pose((verts, faces[1:]), mover, weights=copier(), **UPRIGHT).report
-    assert "1 hole (3 boundary edges)" in str(report) and "the surface is open (1 hole)" in str(report)
+    assert "1 hole (3 boundary edges)" in str(report) and "the surface is open (1 hole, longest loop 0." in str(report)
     many = transfer_pose((verts, faces[1:-1]), mover, weights=copier(), **UPRIGHT).report
     assert "2 holes (6 boundary edges)" in str(many)
+
+
+def without(kind: str, joint: int, who: int = 0) -> Mesh:
+    """A shipped body without what hangs on a joint."""
+    body, split = load_shipped(kind)
+    cut, parents = {joint}, body.parents.tolist()
+    for child in range(joint, len(parents)):
+        cut |= {child} if parents[child] in cut else set()
+    gone = body.weights[:, sorted(cut)].sum(1) > 0.5
+    place = split.test_identities[who : who + 1], split.test_poses[:1]
+    return body(*place)[0], body.faces[~gone[body.faces].any(1)]
+
+
+def test_openings_are_measured():
+    ring = trimesh.creation.cylinder(1.0, 2.0, sections=64)
+    lids = np.abs(ring.face_normals[:, 2]) > 0.5
+    tube = torch.tensor(ring.vertices).float(), torch.tensor(ring.faces[~lids])
+    around = 64 * 2 * math.sin(math.pi / 64)
+    assert_near(opening_lengths(*tube), torch.tensor([around, around]).double(), 1e-5)
+    found = find_openings(*tube)
+    assert found.loops == 2 and found.longest == pytest.approx(around / math.sqrt(2 * around), rel=1e-5)
+    assert "2 boundary loops, the longest 1.77 times" in found.doubt
+    assert find_openings(10 * tube[0], tube[1]).longest == pytest.approx(found.longest, rel=1e-5)
+    closed = find_openings(torch.tensor(ring.vertices), torch.tensor(ring.faces))
+    assert closed == (0, 0.0) and closed.doubt == ""
+
+
+def test_a_wrong_unit_changes_neither_kind_nor_roughness_nor_openings(person):
+    """So the warnings about these have no reason to speak of units."""
+    mesh = without("humans", 24)
+    found = []
+    for factor, unit in ((1.0, None), (1.0, "cm"), (1.0, "ft"), (1000.0, "m"), (0.0254, "in")):
+        options = {"weights": copier(data="humans", usual=WIDE), "pose_unit": unit, **UPRIGHT}
+        report = transfer_pose(person, (factor * mesh[0], mesh[1]), **options).report
+        assert any("far from the size" in text for text in report.warnings) == (unit is not None)
+        pose = report.pose
+        found.append([pose.likeness.score, pose.likeness.distance, pose.roughness, pose.openings.longest])
+    assert_near(torch.tensor(found), torch.tensor(found[:1]).expand(5, 4), 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "joint"), [("humans", 24), ("humans", 5), ("humans", 71), ("animals", 14), ("animals", 29)]
+)
+def test_what_is_cut_off_is_noticed(kind, joint):
+    """A hand, a foot, the head; a fore paw and a hind foot."""
+    for who in (0, 1):
+        assert "give the whole body" in find_openings(*without(kind, joint, who)).doubt
+    body = load_shipped(kind)[0]
+    assert find_openings(body.template, body.faces) == (0, 0.0)
+
+
+def test_an_open_mesh_is_in_doubt(mover):
+    """Whatever its kind; a hole of one face is not, nor are seams of the file, which are welded."""
+    verts, faces = without("humans", 71)
+    report = transfer_pose((verts, faces), mover, weights=copier(data="humans", usual=WIDE), **UPRIGHT).report
+    (said,) = [text for text in report.warnings if "open" in text]
+    assert said.startswith("the identity mesh is open: 1 boundary loop, the longest 0.3")
+    assert report.as_dict()["identity"]["openings"]["loops"] == 1
+    body = load_humans()
+    net = copier(data="humans", usual=WIDE)
+    soup = body.template[body.faces].reshape(-1, 3)
+    seams = soup, torch.arange(len(soup)).reshape(-1, 3)
+    for mesh, is_open in (((body.template, body.faces[1:]), True), (seams, False)):
+        report = transfer_pose(mesh, mover, weights=net, **UPRIGHT).report
+        assert report.warnings == () and ("the surface is open" in str(report)) == is_open
 
 
 def test_no_results_are_no_picture(tmp_path):

@@ -317,6 +317,31 @@ def test_a_browser_draws_the_page(page: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+@pytest.mark.parametrize(("size", "in_a_row"), [((1100, 800), True), ((500, 1100), False)])
+def test_three_bodies_stand_in_one_row_or_one_column(size: tuple[int, int], in_a_row: bool, tmp_path: Path) -> None:
+    """Bodies so wide that two rows would show them larger: there is no empty place, and no name over a body."""
+    wide = VERTS[0] * torch.tensor([2.5, 1.0, 1.0])
+    names = ("identity", "pose", "result")
+    notes = ["one.obj", "two.obj", "a note that takes more than one line " * 8]
+    save_html(tmp_path / "page.html", {name: (wide, BODY.faces) for name in names}, notes=notes)
+    picture = screenshot(tmp_path / "page.html", tmp_path, size)
+    drawn = clay(picture)
+    thirds = np.array_split(drawn, 3, axis=1)
+    shares = [third.mean() for third in thirds]
+    if in_a_row:
+        assert min(shares) > 0.03
+        rows = [np.flatnonzero(third.any(1)) for third in thirds]
+        assert np.ptp([row[0] for row in rows]) <= 1 and np.ptp([row[-1] for row in rows]) <= 1
+    else:
+        assert shares[1] > 3 * max(shares[0], shares[2])
+        edges = np.flatnonzero(np.diff(np.r_[0, drawn.any(1).astype(int), 0]))
+        begins, ends = edges[::2], edges[1::2]
+        assert len(begins) == 3 and np.ptp(np.diff(begins)) <= 1, "three bodies, one under the other"
+        beside = (np.ptp(picture, axis=-1) < 30) & (picture.max(-1) < 150) & ~drawn.any(0)  # the note is wider
+        assert beside[ends[1] : begins[2]].any() and not beside[begins[2] : ends[2]].any()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_a_browser_draws_a_transfer_in_a_frame_of_another_page(tmp_path: Path) -> None:
     """As in the documentation: identity, pose and result in thirds of the frame, on a page of another colour."""
     result = transfer_pose(*((v, BODY.faces) for v in VERTS), weights="corenet3d-humans", refine=False)

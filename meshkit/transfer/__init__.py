@@ -3,7 +3,7 @@
 from meshkit.transfer.confidence import Confidence, measure_confidence, usual_range
 from meshkit.transfer.output import save_page, save_picture
 from meshkit.transfer.report import Doubt, TransferReport, TransferResult
-from meshkit.transfer.sequence import read_sequence, transfer_sequence
+from meshkit.transfer.sequence import UnusablePosesError, read_sequence, transfer_sequence
 from meshkit.transfer.transfer import PoseTransfer, transfer_pose
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "PoseTransfer",
     "TransferReport",
     "TransferResult",
+    "UnusablePosesError",
     "measure_confidence",
     "read_sequence",
     "save_page",

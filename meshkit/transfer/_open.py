@@ -12,7 +12,7 @@ from torch import Tensor
 from meshkit.io import CleanMesh, MeshFileError, MeshReport, SimpleMesh, clean_mesh, load_mesh, mesh_report, simplify
 from meshkit.transfer._kinds import Likeness, guess_kind
 
-__all__ = ["Mesh", "OpenedMesh", "examine", "named", "open_mesh", "read"]
+__all__ = ["Mesh", "OpenedMesh", "clean_body", "examine", "named", "open_mesh", "read"]
 
 T = TypeVar("T")
 Mesh = str | os.PathLike[str] | tuple[Tensor, Tensor]
@@ -96,14 +96,24 @@ def open_mesh(mesh: Mesh, role: str) -> OpenedMesh:
 def examine(name: str, verts: Tensor, faces: Tensor, notes: tuple[str, ...]) -> OpenedMesh:
     """As :func:`open_mesh`, of a mesh that was read."""
     report = named(name, lambda: mesh_report(verts, faces))
+    clean = clean_body(name, verts, faces)
+    if clean.changes:
+        notes += (f"cleaned: {clean}",)
+    return OpenedMesh(name, faces, report, clean, notes)
+
+
+def clean_body(name: str, verts: Tensor, faces: Tensor) -> CleanMesh:
+    """The clean surface of a mesh that was read.
+
+    Raises:
+        ValueError: it cannot be used; the message says why.
+    """
     clean = named(name, lambda: clean_mesh(verts, faces))
     if len(clean.verts) < _FEWEST:
         raise ValueError(
             f"{name}: {len(clean.verts)} vertices in its largest part; a body needs {_FEWEST} or more to be recognised"
         )
-    if clean.changes:
-        notes += (f"cleaned: {clean}",)
-    return OpenedMesh(name, faces, report, clean, notes)
+    return clean
 
 
 def named(name: str, make: Callable[[], T]) -> T:

@@ -37,6 +37,11 @@ class RestBody:
     def __init__(self, net: PretrainedTransfer, kind: str) -> None:
         self.net, self.kind = net, kind
 
+    @property
+    def can_match(self) -> bool:
+        """Whether the weights have a matching."""
+        return isinstance(self.net.generator, PoseTransferGenerator)
+
     def match(self, verts: Tensor, descriptors: Tensor | None) -> TransportPlan | DensePlan:
         """The matching of a mesh (V, 3), about its middle, to the body; in the dtype of the weights."""
         return self._generator.match(self._encode(verts, descriptors), self._encoded)
@@ -129,7 +134,7 @@ def agrees(rest: RestBody, verts: Tensor, faces: Tensor, *, descriptors: Tensor 
 
     True where the weights have no matching to tell by.
     """
-    if not isinstance(rest.net.generator, PoseTransferGenerator):
+    if not rest.can_match:
         return True
     row = agreements(rest, verts, faces, descriptors=descriptors, candidates=rotation[None])
     return float(row[0, 0]) >= AGREEMENT

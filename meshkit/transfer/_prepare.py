@@ -2,17 +2,20 @@
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
+import torch
 from torch import Tensor
 
 from meshkit.io import CleanMesh, MeshReport, SimpleMesh
-from meshkit.io.report import counted
 from meshkit.models import PretrainedTransfer
 from meshkit.transfer._frames import axis_name, rotations
 from meshkit.transfer._kinds import Likeness, rest_body, surface_area
 from meshkit.transfer._open import OpenedMesh, named
+from meshkit.transfer._openings import Openings, find_openings
 from meshkit.transfer._orient import RestBody, agrees, find_rotation
 from meshkit.transfer._units import UNITS, Scale, find_scale, scale_to
+from meshkit.transfer.confidence import roughness
 
 __all__ = ["Prepared", "prepare"]
 
@@ -33,6 +36,7 @@ class Prepared:
         how: what ``rotation`` rests on.
         clear: whether ``rotation`` is beyond doubt.
         likeness: the kind of body that it is like; ``None`` if the weights do not say what they are for.
+        openings: holes of the clean surface; in a sequence, of the first mesh with these faces.
         notes: what was done or should be known.
     """
 
@@ -45,6 +49,7 @@ class Prepared:
     how: str
     clear: bool
     likeness: Likeness | None
+    openings: Openings
     notes: tuple[str, ...]
 
     @property
@@ -61,6 +66,11 @@ class Prepared:
     def verts(self) -> Tensor:
         """(N, 3) simple vertices in the frame of the weights."""
         return self.simple.verts @ self.rotation.T
+
+    @cached_property
+    def roughness(self) -> float:
+        """:func:`~meshkit.transfer.confidence.roughness` of the simple mesh."""
+        return roughness(self.simple.verts, self.simple.faces)
 
     @property
     def up(self) -> Tensor:
@@ -82,6 +92,11 @@ class Prepared:
         if self.how == _GIVEN:
             return (*found, f"the axes given ({axes}) seem wrong: leave them out to have them found")
         return (*found, f"axes in doubt ({axes}): give them, up and facing, if they are wrong")
+
+    def is_same(self, other: "Prepared") -> bool:
+        """Whether both come from the same vertices and faces, at one scale."""
+        same_faces = torch.equal(self.faces.cpu(), other.faces.cpu())
+        return same_faces and torch.equal(self.clean.original, other.clean.original)
 
     def carry(self, deformed: Tensor) -> Tensor:
         """(V, 3) all vertices of the file, from the simple ones (N, 3) deformed; in the frame of the weights."""
@@ -146,13 +161,14 @@ def prepare(
         notes += (f"simplified to {len(simple.verts)} vertices",)
     elif len(simple.verts) < 0.8 * num_verts:
         notes += (f"only {len(simple.verts)} vertices; the weights are used to {num_verts}",)
-    if report.boundary_edges:
-        notes += (f"the surface is open ({counted(report.boundary_loops, 'hole')}), which the weights have not seen",)
+    openings = named(name, lambda: find_openings(clean.verts, clean.faces))  # not of the seams that were welded
+    if openings.loops:
+        notes += (f"the surface is open ({openings}), which the weights have not seen",)
     descriptors = named(name, lambda: net.describe(simple.verts, simple.faces))
     rest = rest or (None if kind is None else RestBody(net, kind))
     rotation, how, clear = named(name, lambda: _rotation(report, simple, descriptors, rest, up, facing))
     rotation = rotation.to(metric.verts)
-    return Prepared(opened, metric, simple, descriptors, scale, rotation, how, clear, likeness, notes)
+    return Prepared(opened, metric, simple, descriptors, scale, rotation, how, clear, likeness, openings, notes)
 
 
 def _scale(opened: OpenedMesh, kind: str | None, likeness: Likeness | None, unit: str | None) -> Scale:

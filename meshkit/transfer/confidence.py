@@ -104,6 +104,8 @@ def measure_confidence(
     output: Any,
     identity_descriptors: Tensor | None = None,
     pose_descriptors: Tensor | None = None,
+    identity_roughness: float | None = None,
+    pose_roughness: float | None = None,
 ) -> Confidence:
     """Measure one transfer.
 
@@ -116,6 +118,8 @@ def measure_confidence(
         output: what ``net.output`` made of them, for one pair.
         identity_descriptors: (V, D) what ``net.describe`` says of the identity mesh, if it was asked already.
         pose_descriptors: (W, D) likewise.
+        identity_roughness: :func:`roughness` of the identity mesh, if it was measured already.
+        pose_roughness: likewise.
     """
     result: GeneratorOutput = output
     spread = mutual = None
@@ -131,8 +135,8 @@ def measure_confidence(
         edge_change=float(edge_ratio(vertices, identity[None], identity_faces)[0]),
         identity_distance=_distance(net, identity, identity_faces, identity_descriptors),
         pose_distance=_distance(net, pose, pose_faces, pose_descriptors),
-        identity_roughness=roughness(identity, identity_faces),
-        pose_roughness=roughness(pose, pose_faces),
+        identity_roughness=roughness(identity, identity_faces) if identity_roughness is None else identity_roughness,
+        pose_roughness=roughness(pose, pose_faces) if pose_roughness is None else pose_roughness,
     )
 
 

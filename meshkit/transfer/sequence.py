@@ -3,7 +3,8 @@
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,18 +15,36 @@ from torch import Tensor
 
 from meshkit.io import MeshFileError, SurfaceBinding
 from meshkit.io._binary_readers import read_scene
+from meshkit.io.report import counted
 from meshkit.transfer._choose import Weights
 from meshkit.transfer._frames import among, rotations, turns_about
-from meshkit.transfer._open import Mesh, examine, named, read
+from meshkit.transfer._kinds import surface_area
+from meshkit.transfer._open import Mesh, clean_body, examine, named, read
 from meshkit.transfer._orient import find_rotation
 from meshkit.transfer._prepare import Prepared
 from meshkit.transfer.report import TransferResult
 from meshkit.transfer.transfer import PoseTransfer
 
-__all__ = ["is_sequence", "read_sequence", "transfer_sequence"]
+__all__ = ["UnusablePosesError", "is_sequence", "read_sequence", "transfer_sequence"]
 
 _MAX_BYTES = 2**30  # of the arrays of a file of many poses
 _FORMATS = {".obj", ".ply", ".off", ".stl", ".glb"}
+
+
+class UnusablePosesError(MeshFileError):
+    """Some of many poses cannot be used.
+
+    Attributes:
+        reasons: what is wrong with each of them, after its name.
+    """
+
+    def __init__(self, reasons: Sequence[str], count: int) -> None:
+        self.reasons = tuple(map(_folded, reasons))
+        advice = "mend or remove them, or leave them out with skip_bad (--skip-bad)"
+        if len(reasons) == count:
+            advice = "there is nothing to transfer"
+        text = f"{len(reasons)} of {counted(count, 'pose')} cannot be used; {advice}:"
+        super().__init__("\n  ".join((text, *self.reasons)))
 
 
 def is_sequence(path: str | os.PathLike[str]) -> bool:
@@ -125,6 +144,7 @@ def transfer_sequence(
     pose_up: str | None = None,
     pose_facing: str | None = None,
     pose_unit: str | None = None,
+    skip_bad: bool = False,
     device: torch.device | str | None = None,
 ) -> Iterator[TransferResult]:
     """Give one identity many poses, one after the other and in their order.
@@ -135,6 +155,9 @@ def transfer_sequence(
     around during a sequence; an axis that was given holds for all. It stays that of the first where ``pose_up`` and
     ``pose_facing`` are both given, or the weights have no matching to find it with. Every pose is transferred by
     itself: nothing is smoothed over time.
+
+    All poses are read and checked before the first transfer, one at a time, so that a damaged file among them is found
+    at once; only those of an iterator, which cannot be gone through twice, are checked as they come.
 
     Args:
         identity: the mesh that gives the body; see :func:`transfer_pose`.
@@ -148,13 +171,15 @@ def transfer_sequence(
         pose_up: of every pose; found if ``None``.
         pose_facing: likewise.
         pose_unit: of the first pose; guessed if ``None``.
+        skip_bad: leave out poses that cannot be read or are no body, and warn which. Otherwise they are an error.
         device: where to compute.
 
     Yields:
         A :class:`TransferResult` for each pose.
 
     Raises:
-        MeshFileError: a file is missing, damaged or no mesh.
+        MeshFileError: a file is missing, damaged or no mesh. Of poses that were checked before the first transfer it is
+            an :class:`UnusablePosesError`, which lists all that cannot be used; with ``skip_bad`` only if none can.
         ValueError: unknown weights or options, or a mesh that cannot be used.
 
     Example:
@@ -177,10 +202,17 @@ def transfer_sequence(
         identity_unit=identity_unit,
         device=device,
     )
+    check = _Check()
+    bad = _bad_ones(meshes, check, skip_bad) if isinstance(meshes, Sequence) else None
     first: Prepared | None = None
     before: Prepared | None = None
     follower: _Follower | None = None
     for number, mesh in enumerate(meshes):
+        if bad is not None and number in bad:
+            continue
+        if bad is None and skip_bad and (why := check(number, mesh)):
+            warnings.warn(f"a pose is left out: {_folded(why)}", stacklevel=2)
+            continue
         start = time.perf_counter()
         name, verts, faces, notes = read(mesh, f"pose {number}")
         if follower is not None and before is not None and follower.fits(verts, faces):
@@ -195,28 +227,72 @@ def transfer_sequence(
             yield transfer.apply(current, start, up=first.up)
 
 
+class _Check:
+    """Says of one pose after the other whether it can be used; it keeps no mesh but the faces of one."""
+
+    def __init__(self) -> None:
+        self._shape, self._faces = torch.Size(), torch.empty(0)
+
+    def __call__(self, number: int, mesh: Mesh) -> str | None:
+        """What is wrong with a pose, after its name; ``None`` if nothing is."""
+        try:
+            name, verts, faces, _ = read(mesh, f"pose {number}")
+            if verts.shape == self._shape and torch.equal(faces, self._faces):
+                _check_follower(name, verts, faces)
+            else:
+                clean_body(name, verts, faces)
+                self._shape, self._faces = verts.shape, faces
+        except OSError as error:  # a file that may not be read, or a folder with the name of one
+            return f"{error.filename or mesh}: {error.strerror or error}"
+        except ValueError as error:
+            return str(error)
+        return None
+
+
+def _bad_ones(meshes: Sequence[Mesh], check: _Check, skip_bad: bool) -> set[int]:
+    """Numbers of the poses that are left out."""
+    bad = {number: why for number, mesh in enumerate(meshes) if (why := check(number, mesh))}
+    if bad and (not skip_bad or len(bad) == len(meshes)):
+        raise UnusablePosesError(tuple(bad.values()), len(meshes))
+    if bad:
+        told = (f"{len(bad)} of {len(meshes)} poses are left out:", *map(_folded, bad.values()))
+        warnings.warn("\n  ".join(told), stacklevel=3)
+    return set(bad)
+
+
+def _check_follower(name: str, verts: Tensor, faces: Tensor) -> None:
+    """The vertices of a mesh whose faces are known to be sound."""
+    if not bool(torch.isfinite(verts).all()):
+        raise ValueError(f"{name}: vertices are NaN or infinite")
+    if not float(surface_area(verts, faces[faces[:, 0] >= 0])) > 0:
+        raise ValueError(f"{name}: the mesh has no surface area")
+
+
+def _folded(text: str) -> str:
+    return " ".join(text.split())
+
+
 class _Follower:
     """Later poses of the mesh that was prepared first: the same cleaning and the same simple vertices."""
 
     def __init__(self, first: Prepared, verts: Tensor, *, allowed: Tensor) -> None:
-        self._first, self._num_verts, self._allowed = first, len(verts), allowed
+        self._first, self._shape, self._allowed = first, verts.shape, allowed
         clean, simple = first.clean, first.simple
         self._binding = SurfaceBinding(simple.verts, simple.faces, clean.verts, clean.faces)
 
     def fits(self, verts: Tensor, faces: Tensor) -> bool:
-        return len(verts) == self._num_verts and torch.equal(faces.cpu(), self._first.faces.cpu())
+        return verts.shape == self._shape and torch.equal(faces.cpu(), self._first.faces.cpu())
 
     def follow(self, transfer: PoseTransfer, name: str, verts: Tensor, before: Prepared) -> Prepared:
         first = self._first
-        if not bool(torch.isfinite(verts).all()):
-            raise ValueError(f"{name}: vertices are NaN or infinite")
+        _check_follower(name, verts, self._first.faces)
         scaled = (verts * first.scale.factor).to(first.clean.verts)
         clean = replace(first.clean, verts=scaled[first.clean.source.to(scaled.device)], original=scaled)
         small = clean.verts if first.simple.method == "none" else self._binding.carry(clean.verts)
         simple = replace(first.simple, verts=small, original=clean.verts)
         descriptors = named(name, lambda: transfer.net.describe(small, simple.faces))
         rotation, clear, rest = before.rotation, before.clear, transfer.rest
-        if len(self._allowed) > 1 and rest is not None and hasattr(transfer.net.generator, "match"):
+        if len(self._allowed) > 1 and rest is not None and rest.can_match:
             rotation, clear = named(
                 name,
                 lambda: find_rotation(

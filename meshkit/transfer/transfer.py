@@ -10,12 +10,13 @@ from torch import Tensor
 from meshkit.deform import arap_deform
 from meshkit.models import GeneratorOutput, PretrainedTransfer
 from meshkit.transfer._choose import Weights, choose_weights
+from meshkit.transfer._doubts import Doubt, said_once
 from meshkit.transfer._frames import axis_name, turn_up
 from meshkit.transfer._open import Mesh, OpenedMesh, named, open_mesh
 from meshkit.transfer._orient import RestBody
 from meshkit.transfer._prepare import Prepared, prepare
 from meshkit.transfer.confidence import Confidence, measure_confidence
-from meshkit.transfer.report import Doubt, TransferReport, TransferResult
+from meshkit.transfer.report import TransferReport, TransferResult
 
 __all__ = ["PoseTransfer", "transfer_pose"]
 
@@ -120,19 +121,14 @@ class PoseTransfer:
         if self.refine is not None:
             small = _refined(own.verts, own.simple.faces, small, self.refine)
         posed = own.carry(small)
-        usual = net.card.get("usual", {})
-        doubts = [*self._strangers(other)]
-        doubts += [Doubt(role, text) for role, mesh in (("identity", own), ("pose", other)) for text in mesh.doubts]
-        for field, text in zip(numbers.unusual(usual), numbers.warnings(usual), strict=True):
-            role = field.partition("_")[0]
-            doubts.append(Doubt(role if role in ("identity", "pose") else "", text))
+        doubts = self._doubts(other, numbers)
         report = TransferReport(
             own,
             other,
             self.weights,
             numbers,
             tuple(doubts),
-            bool(usual),
+            bool(net.card.get("usual")),
             self.refine,
             time.perf_counter() - start,
             self._frame_in_words(other, other.up if up is None else up),
@@ -146,17 +142,33 @@ class PoseTransfer:
         )
         return TransferResult(self._placed(posed, other, other.up if up is None else up).cpu(), faces, report, views)
 
-    def _strangers(self, other: Prepared) -> list[Doubt]:
-        """Which of the two meshes are not of the weights' kind."""
-        found = []
-        for role, mesh in (("identity", self.identity), ("pose", other)):
-            like = mesh.likeness
-            if like is not None and not like.clear:
-                found.append(Doubt(role, f"the {role} mesh has {like.doubt}"))
-            elif like is not None and like.kind != self.kind:
-                shape = f"the {role} mesh has the shape of {like.kind}"
-                found.append(Doubt(role, f"these weights are for {self.kind}, but {shape}: use weights of its kind"))
-        return found
+    def _doubts(self, other: Prepared, numbers: Confidence) -> list[Doubt]:
+        """What is unusual about the two meshes and their transfer; of a mesh of another kind all but that follows."""
+        meshes = {"identity": self.identity, "pose": other}
+        kinds = {role: self._strange(role, mesh) for role, mesh in meshes.items()}
+        hopeless = {role for role, mesh in meshes.items() if kinds[role] and not _between(mesh)}
+        found = [Doubt(role, text) for role, text in kinds.items() if text]
+        for role, mesh in meshes.items():
+            if text := mesh.openings.doubt:  # it may be why a mesh is of no kind, and so does not follow from that
+                found.append(Doubt(role, f"the {role} mesh is {text}"))
+        for role, mesh in meshes.items():
+            found += [Doubt(role, text, role in hopeless) for text in mesh.doubts]
+        usual = self.net.card.get("usual", {})
+        for field, text in zip(numbers.unusual(usual), numbers.warnings(usual), strict=True):
+            role = field.partition("_")[0]
+            about = {role} if role in meshes else set(meshes)
+            found.append(Doubt(role if role in meshes else "", text, bool(about & hopeless)))
+        return said_once(found) if self.identity.is_same(other) else found
+
+    def _strange(self, role: str, mesh: Prepared) -> str:
+        """Why a mesh may not be of the weights' kind; empty if it is."""
+        like = mesh.likeness
+        if like is None or (like.clear and like.kind == self.kind):
+            return ""
+        if not like.clear:
+            return f"the {role} mesh has {like.doubt}"
+        shape = f"the {role} mesh has the shape of {like.kind}"
+        return f"these weights are for {self.kind}, but {shape}: use weights of its kind"
 
     def _frame_in_words(self, other: Prepared, up: Tensor) -> str:
         own = other if self.frame == "pose" else self.identity
@@ -182,13 +194,27 @@ class PoseTransfer:
 def run_network(net: PretrainedTransfer, identity: Prepared, pose: Prepared) -> tuple[GeneratorOutput, Confidence]:
     """What the weights make of two prepared meshes, and the numbers of it."""
     pair = identity.verts, pose.verts
-    faces = {"identity_faces": identity.simple.faces, "pose_faces": pose.simple.faces}
+    faces: dict[str, Any] = {"identity_faces": identity.simple.faces, "pose_faces": pose.simple.faces}
     one, two = identity.descriptors, pose.descriptors
     dtype = next(net.parameters()).dtype
     first, second = (None if described is None else described.to(dtype) for described in (one, two))
     output = net.output(*pair, **faces, identity_descriptors=first, pose_descriptors=second)
-    numbers = measure_confidence(net, *pair, **faces, output=output, identity_descriptors=one, pose_descriptors=two)
+    numbers = measure_confidence(
+        net,
+        *pair,
+        **faces,
+        output=output,
+        identity_descriptors=one,
+        pose_descriptors=two,
+        identity_roughness=identity.roughness,
+        pose_roughness=pose.roughness,
+    )
     return output, numbers
+
+
+def _between(mesh: Prepared) -> bool:
+    """Whether a mesh is like people and animals both, so that the weights may well know it."""
+    return mesh.likeness is not None and not mesh.likeness.clear and not mesh.likeness.neither
 
 
 def _quality(card: dict[str, Any]) -> str:
