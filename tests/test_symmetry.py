@@ -166,6 +166,50 @@ def test_the_generator_looks_at_both_hands_in_evaluation_only(monkeypatch):
     net.train()(a[:1], b[:1], identity_faces=faces[0])
 
 
+@pytest.mark.parametrize("released", [False, True])
+def test_gradients_pass_the_choice_of_hands(monkeypatch, released):
+    """The choice has no derivative; both matchings it chooses from have, by finite differences."""
+    torch.manual_seed(0)
+    options = {"extractor_widths": (5, 6), "k": 4, "widths": (8,), "released": released, "symmetry": True}
+    net = PoseTransferGenerator(**options).double().eval()
+    net.transfer.narrow[-1].weight.data = rand(*net.transfer.narrow[-1].weight.shape)
+    identity, pose, faces = rand(1, 9, 3), rand(1, 8, 3, seed=1), torch.tensor([[0, 1, 2], [2, 3, 4]])
+    monkeypatch.setattr(generator, "mirror_labels", lambda verts, *rest: torch.arange(len(verts)) % 2 == 0)
+    own, other = net.encode(identity).detach().requires_grad_(), net.encode(pose).detach().requires_grad_()
+
+    def moved(own, other):
+        output = net(identity, pose, identity_features=own, pose_features=other, identity_faces=faces)
+        return output.vertices, output.warped
+
+    assert torch.autograd.gradcheck(moved, (own, other))
+    (slope,) = torch.autograd.grad(moved(own, other)[1].square().sum(), own)
+    rows = slope[0].abs().sum(1) > 1e-9
+    assert rows.tolist() == [i % 2 == 1 for i in range(9)]  # those that keep their own features
+    # The others' are the mirror image's, which go back to the extractor.
+    monkeypatch.setattr(generator, "mirror_labels", lambda verts, *rest: torch.ones(len(verts), dtype=torch.bool))
+    net(identity, pose, identity_features=own, pose_features=other, identity_faces=faces).warped.sum().backward()
+    assert all(p.grad is not None and p.grad.any() for p in net.extractor.parameters())
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_an_identity_beside_a_batch_is_looked_at_once(monkeypatch, masked):
+    """Its mirror image too; the result is that of copies."""
+    torch.manual_seed(0)
+    net = PoseTransferGenerator(extractor_widths=(8, 16), k=6, widths=(16, 8), residual=True, symmetry=True).eval()
+    identity, poses, faces = rand(1, 30, 3).float(), rand(3, 20, 3, seed=1).float(), torch.randint(25, (40, 3))
+    mask = torch.arange(30)[None] < 25 if masked else None
+    looked, encode = [], net.encode
+    monkeypatch.setattr(net, "encode", lambda verts, **known: looked.append(len(verts)) or encode(verts, **known))
+    given = {"identity_features": encode(identity, mask=mask), "pose_features": encode(poses)}
+    results = []
+    for repeat in (lambda x: x.expand(3, *x.shape[1:]), lambda x: x.repeat(3, *[1] * (x.dim() - 1))):
+        known = {"identity_features": repeat(given["identity_features"]), "pose_features": given["pose_features"]}
+        known |= {"identity_mask": None if mask is None else repeat(mask), "identity_faces": faces}
+        results.append(net(repeat(identity), poses, **known).vertices)
+    assert looked == [1, 3]
+    assert (results[0] - results[1]).abs().max() < 1e-5
+
+
 def test_gathered_mirror_image_is_the_mirror_image(person):
     """The fixture's partners: nearly symmetric at rest, so that a partner's partner is close."""
     rest, _, _, partner = person
