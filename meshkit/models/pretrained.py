@@ -29,7 +29,9 @@ class PretrainedTransfer(nn.Module):
 
     Meshes must stand in the frame that the weights were trained in: metres, z up, facing -y;
     :func:`meshkit.transfer.transfer_pose` brings others there. Shipped weights warn of a mesh that is longer or shorter
-    than such bodies are. Vertices are differentiable, descriptors are constants.
+    than such bodies are. Vertices are differentiable. Constants are the
+    descriptors, the relative positions in set convolutions and the weights of the rigid moving least squares, so the
+    gradient to the vertices is not whole: ``docs/deviations.md``.
 
     Args:
         generator: :class:`PoseTransferGenerator` or :class:`NPT`.
