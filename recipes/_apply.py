@@ -16,7 +16,7 @@ from meshkit.batching import bounding_box_center, center
 from meshkit.descriptors import intrinsic_descriptors
 from meshkit.io import MeshFileError, load_mesh, save_mesh
 from meshkit.models import GeneratorConfig, load_generator
-from meshkit.models.pretrained import check_extent, extents
+from meshkit.models.pretrained import check_extent, extents, unusual_extent
 
 FROM_1_TO_2 = ("humans", "animals", "smpl", "smal", "faust")
 """Kinds of --data whose bodies are about 1 to 2 long, in metres or units; meshes of folders may be of any size."""
@@ -64,12 +64,12 @@ def trained_on(folder: Path) -> str:
 
 def warn(path: Path, verts: Tensor, kind: str) -> None:
     """Speak up where a mesh is unlike the bodies a model was trained on."""
-    tallest = float(extents(verts).max())
+    odd = unusual_extent(verts, kind)
     axis = "xyz"[int(extents(verts).argmax())]
-    if kind in FROM_1_TO_2 and not 0.5 <= tallest <= 2.6:
+    if kind in FROM_1_TO_2 and odd is not None:
         unit = " metres" if kind in IN_METRES else ""
         print(
-            f"warning: {path} is {tallest:.3g} long; these weights were trained on bodies of about 1 to 2{unit}",
+            f"warning: {path} is {odd:.3g} long; these weights were trained on bodies of about 1 to 2{unit}",
             file=sys.stderr,
         )
     if axis in SELDOM_LONGEST.get(kind, ""):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, cast
@@ -25,6 +26,14 @@ Step = Callable[[nn.Module, PairBatch, Any, float], dict[str, Tensor]]
 
 class Diverged(UserError):
     """A loss or its gradient is not finite."""
+
+
+def refused(error: ValueError, place: str = "") -> Exception:
+    """One line for what meshkit refuses, settings or meshes; any other error is the recipe's own and stays as it is."""
+    *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
+    if innermost.f_globals.get("__name__", "").startswith("meshkit."):
+        return UserError(f"{error}{place}")
+    return error
 
 
 def learning_rate(cfg: Settings, s: int, steps: int) -> float:
@@ -62,7 +71,7 @@ class Trainer:
         try:
             losses, norm = self.gradients(batch, s)
         except ValueError as error:
-            raise UserError(f"{error} ({where(batch, s)})") from None
+            raise refused(error, f" ({where(batch, s)})") from None
         # One transfer tells everything: on a GPU each waits for all that was launched.
         *values, size = torch.stack([*losses.values(), norm]).tolist()
         # Weights that turn NaN would be saved; they are looked at before, not after, the update.

@@ -22,7 +22,7 @@ from _report import evaluate, report
 from _run import Interruption, Run, UserError
 from _settings import Settings
 from _setup import check, initialize, resumed
-from _step import Diverged, Step, Trainer, count_steps
+from _step import Diverged, Step, Trainer, count_steps, refused
 from torch import nn
 from tqdm import tqdm
 
@@ -62,8 +62,14 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
     cfg, state = begin(cfg, run)
     try:
         fabric, cfg = connect(cfg)
-        torch.manual_seed(cfg.seed)
+    except (ValueError, RuntimeError) as error:
+        raise UserError(str(error)) from None
+    torch.manual_seed(cfg.seed)
+    try:
         generator, system = build(cfg)
+    except ValueError as error:
+        raise refused(error) from None
+    try:
         if cfg.init is not None and state is None:  # before the descriptors, which take longer
             initialize(generator, cfg)
         with fabric.rank_zero_first():

@@ -1,6 +1,7 @@
 """Pairs, pools, samplers and loaders: reproducible, with ground truth checked through geometry."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from meshkit.batching import bounding_box_center, center
 from meshkit.data import (
+    MeshPairs,
     MeshPool,
     PairBatch,
     PairSampler,
@@ -448,6 +450,36 @@ def test_loader_gives_the_same_batches_with_and_without_workers(pairs):
     for mine, theirs, addresses in zip(here, there, sampler, strict=True):
         assert_same(mine, theirs)
         assert_same(mine, pairs[addresses])
+
+
+def test_a_pool_of_other_meshes_than_listed_is_refused(humans: RiggedModel) -> None:
+    listed = torch.tensor([[0, 1, 2, 3], [4, 5, 6, 7]])
+    who, how = listed.view(-1, 2).unbind(1)
+    few = torch.arange(2)
+
+    def pool(who: Tensor, how: Tensor) -> MeshPool:
+        return MeshPool(who, how, torch.zeros(len(who), 1000, 3), torch.zeros(len(who), 1000, 2))
+
+    PosePairs(humans, few, few, listed=listed, pool=pool(who, how))
+    for other in (pool(who.flip(0), how.flip(0)), pool(who, who), pool(who[:2], how[:2])):
+        with pytest.raises(ValueError, match=r"must hold the 4 listed meshes in their order"):
+            PosePairs(humans, few, few, listed=listed, pool=other)
+
+
+@pytest.mark.parametrize("key", [5, [0, 1], [], torch.tensor([[0, 1]]), (0, 1, 2), (0.5, 1), slice(2)])
+def test_pairs_are_addressed_by_epoch_and_number(key: Any, humans: RiggedModel) -> None:
+    pairs = PosePairs(humans, torch.arange(2), torch.arange(2))
+    meshes = MeshPairs.__new__(MeshPairs)  # the key is looked at before the store
+    said = r"address pairs by \(epoch, i\).*pair_loader\(pairs, PairSampler\(\.\.\.\)\)"
+    for dataset in (pairs, meshes):
+        with pytest.raises(TypeError, match=said):
+            dataset[key]
+    assert pairs[[[0, 1]]].identity.equal(pairs[(0, 1)].identity)
+
+
+def test_a_sampler_begins_at_a_step_from_0_on() -> None:
+    with pytest.raises(ValueError, match="start must be a step from 0 on, got -3"):
+        PairSampler(10, 2, start=-3, stop=4)
 
 
 def test_listed_pairs_are_the_rows_of_the_list_with_and_without_a_pool() -> None:

@@ -211,6 +211,32 @@ def test_descriptors_are_standardised_and_bounded():
 # 3D-CoreNet: pointwise extractor, theta and phi
 
 
+def test_fitted_descriptors_are_those_of_real_vertices():
+    net = make(descriptors=3)
+    values, mask = rand(2, 5, 3), torch.arange(5).expand(2, 5) < torch.tensor([[5], [3]])
+    net.fit_descriptors(values.masked_fill(~mask[..., None], GARBAGE[0]), mask=mask)
+    rows = torch.cat([values[0], values[1, :3]])
+    assert_near(net.descriptor_mean, rows.mean(0), 1e-6)
+    assert_near(net.descriptor_std, rows.std(0), 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "mask", "message"),
+    [
+        (torch.zeros(1, 3), None, "two vertices or more, got 1"),
+        (torch.zeros(2, 4, 3), torch.arange(8).view(2, 4) < 1, "two vertices or more, got 1"),
+        (torch.zeros(5, 1), None, r"takes 3 descriptor channels, got \(5, 1\)"),
+        (torch.zeros(3), None, r"takes 3 descriptor channels, got \(3,\)"),
+        (torch.zeros(2, 4, 3), torch.ones(4, dtype=torch.bool), r"mask must be bool \(2, 4\), got torch.bool \(4,\)"),
+    ],
+)
+def test_descriptors_that_cannot_be_fitted(values, mask, message):
+    net = make(descriptors=3)
+    with pytest.raises(ValueError, match=message):
+        net.fit_descriptors(values, mask=mask)
+    assert not net.descriptor_mean.any() and bool((net.descriptor_std == 1).all())
+
+
 def test_pointwise_extractor_equals_its_equation():
     torch.manual_seed(0)
     net = PointwiseExtractor((4, 6), blocks=2, descriptors=1).double()
@@ -363,6 +389,12 @@ def test_npt_errors():
         net(mesh, mesh[:1])
     with pytest.raises(ValueError, match=r'equal vertex counts, got 9 and 8: use variant="maxpool"'):
         net(mesh, mesh[:, :8])
+    few, most = torch.arange(9).expand(2, 9) < 6, torch.arange(9).expand(2, 9) < 8
+    for masks in ({"identity_mask": few, "pose_mask": most}, {"pose_mask": few}, {"identity_mask": most}):
+        with pytest.raises(ValueError, match='variant="original" pairs vertices by their index and needs equal masks'):
+            net(mesh, mesh, **masks)
+    net(mesh, mesh, identity_mask=few, pose_mask=few.clone())
+    net(mesh, mesh, identity_mask=torch.ones(2, 9, dtype=torch.bool))
     with pytest.raises(ValueError, match="NPT takes no descriptors"):
         net(mesh, mesh, pose_descriptors=mesh)
     with pytest.raises(ValueError, match="NPT takes no descriptors"):
@@ -420,6 +452,26 @@ def test_released_matching_reads_like_a_plan():
     ):
         assert_near(read(plan), read(expected), 1e-5)
     assert torch.equal(plan.argmax(), expected.argmax()) and torch.equal(plan.argmax(1), expected.argmax(1))
+    assert plan.device == expected.device
+    assert_near(plan.entropy(), expected.entropy(), 1e-5)
+    for ours, theirs in zip(plan.mutual(), expected.mutual(), strict=True):
+        assert torch.equal(ours, theirs)
+    for dim in (1, 2):
+        (ours, at), (theirs, index) = plan.topk(3, dim=dim), expected.topk(3, dim=dim)
+        assert_near(ours, theirs, 1e-5)
+        assert torch.equal(at, index)
+    for k, dim, message in ((18, 2, "between 1 and 17"), (13, 1, "between 1 and 12"), (1, 0, "dim must be 1")):
+        with pytest.raises(ValueError, match=message):
+            plan.topk(k, dim=dim)
+    mask_a, mask_b = scattered_mask([7, 12], 12), scattered_mask([9, 17], 17)
+    options = {"identity_mask": mask_a, "pose_mask": mask_b}
+    plan, expected = (n(identity, pose, **options).plan for n in (net, plain))
+    assert_near(plan.entropy(), expected.entropy(), 1e-5)
+    for read in (lambda p: p.mutual()[1], lambda p: torch.where(p.mutual()[1], p.mutual()[0], 0)):
+        assert torch.equal(read(plan), read(expected))
+    masses, index = plan.topk(17)
+    assert not masses[0, :, 9:].any() and not index[0, :, 9:].any() and not masses[~mask_a].any()
+    plan, expected = net(identity, pose).plan, plain(identity, pose).plan
     assert_near(backward_correspondence_loss(plan, pose), backward_correspondence_loss(plan.dense(), pose), 1e-10)
 
 
@@ -619,6 +671,17 @@ def test_spectral_normalisation_sits_on_the_blocks_alone(spectral):
 
 
 # Errors of the forward pass
+
+
+@pytest.mark.parametrize("option", [{"n_iters": 1.5}, {"k": 4.5}])
+def test_counts_are_whole_numbers(option):
+    with pytest.raises(ValueError, match="n_iters and k must be whole numbers, got"):
+        make(**option)
+
+
+def test_there_is_no_reset_of_a_part():
+    """``reset_parameters`` means all of a module in torch; norms and spectral originals would keep what they have."""
+    assert not hasattr(PoseTransferGenerator, "reset_parameters") and not hasattr(NPT, "reset_parameters")
 
 
 def test_generator_errors():

@@ -107,6 +107,26 @@ def test_relative_positions_carry_no_gradient():
 
 
 @recompute
+def test_relative_positions_carry_their_gradient_where_it_is_asked_for(recompute):
+    """By finite differences, of both arguments and in a padded batch; values stay as they are."""
+    options = {"recompute": recompute, "relative_gradient": True}
+    conv, mask = randomise(SetConv(2, 3, **options).double()), scattered_mask([8, 6], 9)
+    x, positions = rand(2, 9, 2).requires_grad_(), rand(2, 9, 3, seed=1).requires_grad_()
+    neighbors = knn(positions.detach(), K, mask=mask)
+    assert torch.autograd.gradcheck(lambda a, b: conv(a, b, neighbors, mask=mask), (x, positions), fast_mode=True)
+    (slope,) = torch.autograd.grad(conv(x, positions, neighbors, mask=mask).square().sum(), positions)
+    assert slope[mask].abs().sum(1).min() > 0 and not slope[~mask].any()
+    extractor = randomise(SetConvExtractor((4, 3), k=K, **options).double())
+    plain = SetConvExtractor((4, 3), k=K, recompute=recompute).double()
+    plain.load_state_dict(extractor.state_dict())
+    verts = rand(1, 9, 3, seed=2).requires_grad_()
+    assert torch.autograd.gradcheck(extractor, (verts,), fast_mode=True)
+    assert torch.equal(extractor(verts), plain(verts))
+    whole, half = (torch.autograd.grad(net(verts).square().sum(), verts)[0] for net in (extractor, plain))
+    assert (whole - half).norm() > 0.1 * whole.norm()
+
+
+@recompute
 @pytest.mark.parametrize("garbage", GARBAGE)
 def test_setconv_padded_batch_equals_the_loop(garbage, recompute, block):
     conv, sizes = randomise(SetConv(4, 6, recompute=recompute).double()), [8, 12, 5]

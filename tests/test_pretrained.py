@@ -343,6 +343,60 @@ def test_shipped_weights_refuse_what_cannot_be_metres(scale):
         net(scale * body.template, body.template, identity_faces=body.faces, pose_faces=body.faces)
 
 
+def carded(data: str) -> PretrainedTransfer:
+    net = network(PLAIN)
+    net.card = {"data": data}
+    return net
+
+
+def long(*lengths: float) -> torch.Tensor:
+    """Meshes of the given longest sides, one behind the other, 6 apart."""
+    verts = 0.2 * rand(len(lengths), 30, 3).float().clamp(-1, 1)
+    ends = torch.tensor(lengths)[:, None] / 2 * torch.tensor([-1.0, 1.0])
+    verts[:, :2] = 0
+    verts[:, :2, 2] = ends
+    return verts + 6 * torch.arange(len(lengths))[:, None, None] * torch.tensor([1.0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("data", "lengths", "said"),
+    [
+        ("humans", (1.7, 1.6, 1.8, 1.9, 1.7), None),
+        ("humans", (1.7, 5.1), "identity is 5.1 long"),
+        ("humans", (0.4, 1.7), "identity is 0.4 long"),
+        ("animals", (1.7, 3.9), None),
+        ("smal:a.pkl", (3.9,), None),
+        ("smal:a.pkl", (4.1,), "identity is 4.1 long"),
+    ],
+)
+def test_shipped_weights_warn_of_sizes_that_no_body_has(data, lengths, said, recwarn):
+    """Of each mesh by itself: each is centred by itself, so bodies may stand far apart."""
+    identity, pose = long(*lengths), long(1.7)
+    carded(data)(identity, pose)
+    assert [str(w.message).partition(";")[0] for w in recwarn] == ([] if said is None else [said])
+
+
+def test_each_mesh_of_a_batch_must_have_a_size_that_may_be_metres():
+    with pytest.raises(ValueError, match="pose 1 is 170 long, but these weights take meshes of about 1 to 2"):
+        carded("humans")(long(1.7), long(1.7, 170.0))
+    verts, mask = long(1.7, 1.7), torch.ones(2, 30, dtype=torch.bool)
+    verts[1, 29], mask[1, 29] = 1e3, False
+    carded("humans")(long(1.7), verts, pose_mask=mask)
+
+
+def test_masks_of_single_meshes():
+    net = network(PLAIN)
+    identity, pose = rand(30, 3).float(), rand(40, 3, seed=1).float()
+    few, mask = torch.arange(30) < 25, torch.arange(40) < 33
+    result = net.output(identity, pose, identity_mask=few, pose_mask=mask)
+    assert_near(result.vertices[:25], net(identity[:25], pose[:33]), 1e-5)
+    assert not result.vertices[25:].any() and not result.warped[25:].any()
+    both = net(identity, torch.stack([pose, pose + 1]), identity_mask=few)
+    assert_near(both[1][:25], net(identity[:25], pose + 1), 1e-5)
+    with pytest.raises(ValueError, match=r"pose_mask must have shape \(1, 40\)"):
+        net(identity, pose, pose_mask=few)
+
+
 def test_shipped_weights_take_float64():
     net, body = load_pretrained("corenet3d-humans"), load_humans(1000)
     sides = {"identity_faces": body.faces, "pose_faces": body.faces}

@@ -9,6 +9,8 @@ import trimesh
 from PIL import Image
 
 from meshkit.viz import contact_sheet, error_colors, plot_curves, render
+from meshkit.viz._mesh import GAMMA
+from meshkit.viz.rasterizer import _INSIDE
 
 RED, GREEN, BLUE = np.eye(3)
 FRONT = {"azimuth": 0.0, "elevation": 0.0}
@@ -125,6 +127,20 @@ def test_light_comes_from_above_left_and_insides_are_dark() -> None:
     assert (inside[10:50, 25:35] < outside[10:50, 25:35]).all()
     flat = render(SPHERE.vertices, SPHERE.faces, size=(60, 60), shading="flat").mean(-1)
     np.testing.assert_allclose(flat[10:50, 10:50], outside[10:50, 10:50], atol=8)  # a fine mesh: nearly equal
+
+
+@pytest.mark.parametrize("shading", ["flat", "smooth"])
+def test_faces_seen_from_inside_are_lit_as_from_outside_but_darker(shading: str) -> None:
+    """An open box and the same with faces flipped: in linear light they differ by the factor, and by the highlight."""
+    box = trimesh.creation.box()
+    faces = box.faces[box.triangles_center[:, 2] < 0.49]  # without the lid
+    view = {"colors": np.full((8, 3), 0.8), "shading": shading, "supersample": 1, "azimuth": 25, "elevation": 35}
+    pictures = [render(box.vertices, f, **view)[..., 0] for f in (faces, faces[:, ::-1])]
+    drawn = covered(render(box.vertices, faces, **view))
+    outward, inward = ((picture[drawn] / 255) ** GAMMA for picture in pictures)
+    assert (outward > inward).mean() > 0.2 < (outward < inward).mean()  # both sides of the walls are seen
+    brighter, darker = np.maximum(outward, inward), np.minimum(outward, inward)
+    np.testing.assert_allclose(darker, _INSIDE * brighter, atol=0.03)
 
 
 def test_smooth_shading_hides_the_facets() -> None:

@@ -184,6 +184,8 @@ def test_turntable_turns_in_place() -> None:
     upright = VERTS[1] @ torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     again = turntable(upright, BODY.faces, frames=4, size=(60, 80), up="y")
     assert np.abs(np.stack(again).astype(int) - np.stack(frames)).mean() < 0.5
+    quarter = turntable(VERTS[1], BODY.faces, frames=4, size=(60, 80), azimuth=90)
+    assert np.abs(np.stack(quarter).astype(int) - np.stack([*frames[1:], frames[0]])).mean() < 0.1
     with pytest.raises(ValueError, match="a frame or more, got 0"):
         turntable(VERTS[1], BODY.faces, frames=0)
     with pytest.raises(ValueError, match="nothing to draw"):
@@ -213,6 +215,19 @@ def test_animations_keep_frames_and_colours(tmp_path: Path) -> None:
     for name, pictures, options, message in cases:
         with pytest.raises(ValueError, match=message):
             save_animation(tmp_path / name, pictures, **options)
+
+
+def test_a_colour_that_one_frame_only_has_is_kept(tmp_path: Path) -> None:
+    ramp = np.linspace(0, 255, 80).astype(np.uint8)
+    plain = np.stack(np.broadcast_arrays(ramp[:, None], ramp[None, :60], np.uint8(128)), axis=2)
+    frames = [np.roll(plain, number, axis=1) for number in range(36)]
+    patch = np.array([255, 0, 0])
+    frames[17][30:40, 20:30] = patch
+    save_animation(tmp_path / "patch.gif", frames)
+    with Image.open(tmp_path / "patch.gif") as movie:
+        movie.seek(17)
+        shown = np.asarray(movie.convert("RGB")).astype(int)
+    assert np.abs(shown[30:40, 20:30] - patch).max() <= 8
 
 
 @pytest.fixture

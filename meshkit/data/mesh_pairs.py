@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 
 from meshkit.batching import center
 from meshkit.data.batch import PairBatch
-from meshkit.data.sampler import seeded
+from meshkit.data.sampler import addresses_of, seeded
 from meshkit.data.store import MeshStore
 
 __all__ = ["MeshPairs"]
@@ -48,6 +48,7 @@ class MeshPairs(Dataset[PairBatch]):
     Raises:
         ValueError: a length or window below 1, negative noise, less than two meshes, no ground truth in the store,
             meshes of one identity that differ in vertex count, or listed places that are not there.
+        TypeError: indexed with anything but addresses.
 
     Example:
         >>> import tempfile
@@ -107,7 +108,7 @@ class MeshPairs(Dataset[PairBatch]):
     @torch.no_grad()
     def __getitem__(self, address: tuple[int, int] | Sequence[tuple[int, int]]) -> PairBatch:
         """The pairs at one or several ``(epoch, i)``, as a batch."""
-        addresses = [address] if isinstance(address, tuple) else address
+        addresses = addresses_of(address)
         store, dice = self.store, torch.Generator()
         draws = torch.tensor([self._draw(dice, epoch if self.resample else 0, i) for epoch, i in addresses])
         a, b, c = draws.unbind(1)

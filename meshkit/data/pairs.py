@@ -14,7 +14,7 @@ from meshkit.batching import center
 from meshkit.data.batch import PairBatch
 from meshkit.data.pool import MeshPool
 from meshkit.data.rigged import RiggedModel
-from meshkit.data.sampler import seeded
+from meshkit.data.sampler import addresses_of, seeded
 from meshkit.neighbors import gather_vertices
 
 __all__ = ["PosePairs"]
@@ -51,7 +51,9 @@ class PosePairs(Dataset[PairBatch]):
 
     Raises:
         ValueError: an empty list, a length below 1, indices beyond the model's tables, a model without tables,
-            negative noise, or noise with a pool, whose descriptors are of clean meshes.
+            negative noise, noise with a pool, whose descriptors are of clean meshes, or a pool of other meshes than
+            those listed.
+        TypeError: indexed with anything but addresses.
 
     Reference:
         X-DualNet, "Datasets": 6400 pairs, vertices shuffled, bounding-box centring.
@@ -104,6 +106,13 @@ class PosePairs(Dataset[PairBatch]):
             raise ValueError(
                 f"pose_noise must be >= 0, and 0 with a pool, whose descriptors are of clean meshes; got {pose_noise}"
             )
+        if listed is not None and pool is not None:
+            wanted, held = listed.cpu().reshape(-1, 2), torch.stack([pool.identity, pool.pose], 1).cpu()
+            if wanted.shape != held.shape or bool((wanted != held).any()):
+                raise ValueError(
+                    f"the pool must hold the {len(wanted)} listed meshes in their order, those of listed.view(-1, 2); "
+                    f"its {len(held)} are others"
+                )
         self.model, self.pool = model, pool
         self.identities, self.poses = identities.cpu(), poses.cpu()
         self.length = length if listed is None else len(listed)
@@ -129,7 +138,7 @@ class PosePairs(Dataset[PairBatch]):
     @torch.no_grad()
     def __getitem__(self, address: tuple[int, int] | Sequence[tuple[int, int]]) -> PairBatch:
         """The pairs at one or several ``(epoch, i)``, as a batch."""
-        addresses = [address] if isinstance(address, tuple) else address
+        addresses = addresses_of(address)
         meshes, orders, noise = self._draw(addresses)
         return self._assemble(
             meshes.to(self.device, non_blocking=True),

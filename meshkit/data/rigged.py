@@ -53,7 +53,8 @@ class RiggedModel(nn.Module):
               v' = \sum_j w_j \bigl(G_j (v - J_j) + q_j\bigr)
 
     Local rotations are expressed in axes aligned with the world at rest, so one set of rotations is the same pose on
-    every identity. Everything is a buffer: ``.to(device)`` moves it, and gradients flow to shape and pose.
+    every identity. Everything is a buffer: ``.to(device)`` moves it, and gradients flow to shape and pose. No buffer is
+    persistent: ``state_dict()`` is empty, and a model that holds a body stores none of it.
 
     Args:
         template: ``(V, 3)`` mean shape.

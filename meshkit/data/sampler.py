@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
@@ -47,6 +48,8 @@ class PairSampler(Sampler[list[tuple[int, int]]]):
     ) -> None:
         if batch_size < 1 or not 0 <= rank < world_size:
             raise ValueError(f"need a batch and 0 <= rank < world_size, got {batch_size}, {rank} and {world_size}")
+        if start < 0:
+            raise ValueError(f"start must be a step from 0 on, got {start}")
         self.steps_per_epoch = length // (batch_size * world_size)
         if self.steps_per_epoch < 1:
             raise ValueError(
@@ -96,6 +99,25 @@ def pair_loader(
         persistent_workers=workers > 0,
         pin_memory=pin_memory,
     )
+
+
+def addresses_of(key: Any) -> Sequence[tuple[int, int]]:
+    """The one or several ``(epoch, i)`` that pairs are indexed with.
+
+    Raises:
+        TypeError: anything else, as from a loader that counts samples.
+    """
+    addresses = [key] if isinstance(key, tuple) else key
+    if isinstance(addresses, list) and addresses and all(map(_is_address, addresses)):
+        return addresses
+    raise TypeError(
+        f"address pairs by (epoch, i), or a list of these, got {key!r}; "
+        "for batches use pair_loader(pairs, PairSampler(...))"
+    )
+
+
+def _is_address(entry: Any) -> bool:
+    return isinstance(entry, tuple | list) and len(entry) == 2 and all(hasattr(part, "__index__") for part in entry)
 
 
 def seeded(generator: torch.Generator, seed: int, epoch: int, i: int) -> torch.Generator:

@@ -31,6 +31,11 @@ class DensePlan:
         return self._matrix.dtype
 
     @property
+    def device(self) -> torch.device:
+        """Of the masses."""
+        return self._matrix.device
+
+    @property
     def T(self) -> DensePlan:
         """The transposed plan."""
         return DensePlan(self._matrix.mT, floor=self._floor)
@@ -56,6 +61,25 @@ class DensePlan:
     def argmax(self, dim: int = 2) -> Tensor:
         """Index of the heaviest entry of each row (``dim=2``) or column (``dim=1``)."""
         return self._matrix.argmax(dim)
+
+    def topk(self, k: int, *, dim: int = 2) -> tuple[Tensor, Tensor]:
+        """Masses and indices of the ``k`` heaviest entries of each row or column; both 0 where there is no mass."""
+        if dim not in (1, 2, -1, -2):
+            raise ValueError(f"dim must be 1 (best rows of each column) or 2 (best columns of each row), got {dim}")
+        if not 1 <= k <= self.shape[dim]:
+            raise ValueError(f"k must be between 1 and {self.shape[dim]}, the number of candidates, got {k}")
+        masses, index = (self._matrix if dim in (2, -1) else self._matrix.mT).topk(k, 2)
+        return masses, torch.where(masses > 0, index, 0)
+
+    def mutual(self) -> tuple[Tensor, Tensor]:
+        """The heaviest column of each row, and whether that column prefers this row too."""
+        best, back = self.argmax(2), self.argmax(1)
+        rows = torch.arange(best.shape[1], device=self.device)
+        return best, (back.gather(1, best) == rows) & (self.row_sums() > 0)
+
+    def entropy(self) -> Tensor:
+        r"""Entropy :math:`-\sum_{ij} T_{ij} \log T_{ij}` of each sample, ``(B,)``, in nats."""
+        return torch.special.entr(self._matrix).sum((1, 2))
 
     def dense(self) -> Tensor:
         """The matrix itself."""

@@ -80,7 +80,8 @@ class PoseTransferGenerator(nn.Module):
         ``(B, M, D)``.
 
     Raises:
-        ValueError: meshes are not (B, V, 3), batches differ, descriptors are missing, fewer than ``k`` vertices.
+        ValueError: meshes are not (B, V, 3), batches differ, descriptors are missing, fewer than ``k`` vertices;
+            options out of range, or ``n_iters`` and ``k`` that are no whole numbers.
 
     Reference:
         X-DualNet, "Network architecture"; sizes in the appendix.
@@ -116,6 +117,8 @@ class PoseTransferGenerator(nn.Module):
         super().__init__()
         if not eps > 0 or n_iters < 1 or k < 1:
             raise ValueError(f"eps, n_iters and k must be positive, got {eps}, {n_iters} and {k}")
+        if n_iters != int(n_iters) or k != int(k):
+            raise ValueError(f"n_iters and k must be whole numbers, got {n_iters} and {k}")
         if not widths or not extractor_widths or min(*widths, *extractor_widths) < 1:
             raise ValueError(f"widths must be positive, got {extractor_widths} and {widths}")
         if extractor not in ("setconv", "pointwise"):
@@ -150,12 +153,13 @@ class PoseTransferGenerator(nn.Module):
         self.transfer = stack(cond_features, widths, norm=_NORMS[norm], spectral=spectral, residual=residual)
         self.register_buffer("descriptor_mean", torch.zeros(descriptors))
         self.register_buffer("descriptor_std", torch.ones(descriptors))
-        self.reset_parameters()
+        self._initialize()
 
     descriptor_mean: Tensor
     descriptor_std: Tensor
 
-    def reset_parameters(self) -> None:
+    # Not reset_parameters: it draws what a fresh network's parts leave to it, and leaves the rest as it is.
+    def _initialize(self) -> None:
         """Xavier initialisation, with a last layer small enough that training starts from a mesh near the centre."""
         for module in self.modules():
             # Spectral normalisation fixes the scale of the maps it wraps, so theirs does not matter.
@@ -171,9 +175,23 @@ class PoseTransferGenerator(nn.Module):
         return f"{matching}, {settings(self, 'condition', 'rigid_radius', 'poisson_weight', 'match_size', 'symmetry')}"
 
     @torch.no_grad()
-    def fit_descriptors(self, descriptors: Tensor) -> None:
-        """Take mean and deviation of the training set's descriptors ``(..., D)``; inputs are standardised by them."""
-        flat = descriptors.flatten(0, -2)
+    def fit_descriptors(self, descriptors: Tensor, *, mask: Tensor | None = None) -> None:
+        """Take mean and deviation of the training set's descriptors ``(..., D)``; inputs are standardised by them.
+
+        Args:
+            descriptors: of all vertices of the training set.
+            mask: ``(...)`` bool, True = real vertex; rows of padding do not count.
+
+        Raises:
+            ValueError: another number of channels than the model's, another shape of the mask, or fewer than two rows.
+        """
+        if descriptors.shape[1:][-1:] != self.descriptor_mean.shape:
+            raise ValueError(self._other_channels(descriptors))
+        if mask is not None and (mask.dtype != torch.bool or mask.shape != descriptors.shape[:-1]):
+            raise ValueError(f"mask must be bool {tuple(descriptors.shape[:-1])}, got {mask.dtype} {tuple(mask.shape)}")
+        flat = descriptors.flatten(0, -2) if mask is None else descriptors[mask]
+        if len(flat) < 2:
+            raise ValueError(f"a deviation needs the descriptors of two vertices or more, got {len(flat)}")
         self.descriptor_mean.copy_(flat.mean(0))
         self.descriptor_std.copy_(flat.std(0).clamp_min(1e-6))
 
@@ -187,11 +205,12 @@ class PoseTransferGenerator(nn.Module):
 
     def _standardise(self, descriptors: Tensor) -> Tensor:
         if descriptors.shape[2:] != self.descriptor_mean.shape:
-            raise ValueError(
-                f"this model takes {len(self.descriptor_mean)} descriptor channels, got {tuple(descriptors.shape)}"
-            )
+            raise ValueError(self._other_channels(descriptors))
         # Signatures have long tails where a mesh has spikes; four deviations hold all that is signal.
         return ((descriptors - self.descriptor_mean) / self.descriptor_std).clamp(-4, 4)
+
+    def _other_channels(self, descriptors: Tensor) -> str:
+        return f"this model takes {len(self.descriptor_mean)} descriptor channels, got {tuple(descriptors.shape)}"
 
     def match(
         self,
@@ -219,7 +238,6 @@ class PoseTransferGenerator(nn.Module):
         values = positions.to(plan.dtype)
         return plan, plan.barycentric(values) if self.normalize_plan else plan @ values
 
-    @torch.no_grad()
     def _handed(
         self,
         verts: Tensor,
@@ -229,10 +247,23 @@ class PoseTransferGenerator(nn.Module):
         *pair: Any,
     ) -> Tensor:
         """Features of the identity mesh, of its mirror image where that is what a vertex is better matched as."""
+        whole = (verts, features, pair[2], descriptors)
+        # An identity beside several poses comes as one mesh, expanded: its mirror image is one too.
+        once = all(x is None or x.stride(0) == 0 for x in whole)
+        one, own, mask, known = (x[:1] if once and x is not None else x for x in whole)
+        mirrored = self.encode(one * one.new_tensor([-1.0, 1.0, 1.0]), mask=mask, descriptors=known)
+        with torch.no_grad():  # which sides correspond is a choice, without a derivative
+            partners = self.match(mirrored, own, identity_mask=mask, pose_mask=mask).argmax()
+        mirrored, partners = (x.expand(len(verts), *x.shape[1:]) for x in (mirrored, partners))
+        labels = self._labels(verts, faces, features, mirrored, partners, *pair)
+        return torch.where(labels[..., None], mirrored, features)
+
+    @torch.no_grad()
+    def _labels(
+        self, verts: Tensor, faces: Tensor, features: Tensor, mirrored: Tensor, partners: Tensor, *pair: Any
+    ) -> Tensor:
         mask = pair[2]
-        mirrored = self.encode(verts * verts.new_tensor([-1.0, 1.0, 1.0]), mask=mask, descriptors=descriptors)
         targets, others = (self._warp(f, *pair)[1] for f in (features, mirrored))
-        partners = self.match(mirrored, features, identity_mask=mask, pose_mask=mask).argmax()
         labels = []
         for b in range(len(verts)):
             real = slice(None) if mask is None else mask[b].nonzero()[:, 0]
@@ -243,7 +274,7 @@ class PoseTransferGenerator(nn.Module):
                 mesh[1], mesh[4] = place[mesh[1]], place[mesh[4]]
             labels.append(torch.zeros(verts.shape[1], dtype=torch.bool, device=verts.device))
             labels[-1][real] = mirror_labels(*mesh)
-        return torch.where(torch.stack(labels)[..., None], mirrored, features)
+        return torch.stack(labels)
 
     def _flesh_out(self, identity: Tensor, warped: Tensor, mask: Tensor | None, features: Tensor | None) -> Tensor:
         options: dict[str, Any] = {"radius": self.rigid_radius, "mask": mask, "features": features}

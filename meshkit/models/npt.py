@@ -65,13 +65,14 @@ class NPT(nn.Module):
         self.variant = variant
         self.encoder = _PoseEncoder(encoder_widths)
         self.decoder = _Decoder(encoder_widths[-1], bare_start=variant == "maxpool")
-        self.reset_parameters()
+        self._initialize()
 
     def extra_repr(self) -> str:
         """Options in the printed module."""
         return settings(self, "variant")
 
-    def reset_parameters(self) -> None:
+    # Not reset_parameters: it draws what a fresh network's parts leave to it, and leaves the rest as it is.
+    def _initialize(self) -> None:
         """Xavier initialisation, with a last layer small enough that training starts from a mesh near the centre."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
@@ -79,7 +80,7 @@ class NPT(nn.Module):
         nn.init.normal_(self.decoder.narrow[-1].get_parameter("weight"), std=1e-3)
         nn.init.zeros_(self.decoder.narrow[-1].get_parameter("bias"))
 
-    def fit_descriptors(self, descriptors: Tensor) -> None:
+    def fit_descriptors(self, descriptors: Tensor, *, mask: Tensor | None = None) -> None:
         """Refuse: there are no descriptors to standardise."""
         _refuse(descriptors)
 
@@ -120,6 +121,10 @@ class NPT(nn.Module):
             raise ValueError(
                 'variant="original" pairs vertices by their index and needs equal vertex counts, got '
                 f'{identity.shape[1]} and {pose.shape[1]}: use variant="maxpool"'
+            )
+        if self.variant == "original" and not _same_mask(identity_mask, pose_mask):
+            raise ValueError(
+                'variant="original" pairs vertices by their index and needs equal masks: use variant="maxpool"'
             )
         _refuse(identity_descriptors, pose_descriptors)
         features = self.encode(pose, mask=pose_mask) if pose_features is None else pose_features
@@ -209,6 +214,13 @@ class _Modulation(SPAdaIN):
     def statistics(self, x: Tensor, *, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         mean = x.new_zeros(len(x), 1, x.shape[2], dtype=torch.promote_types(x.dtype, torch.float32))
         return mean, torch.ones_like(mean)
+
+
+def _same_mask(first: Tensor | None, second: Tensor | None) -> bool:
+    """Whether two masks mark the same vertices; no mask marks all."""
+    if first is None or second is None:
+        return all(mask is None or bool(mask.all()) for mask in (first, second))
+    return torch.equal(first, second)
 
 
 def _refuse(*descriptors: Tensor | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from difflib import get_close_matches
 from importlib.resources import files
 from typing import Any
@@ -10,14 +11,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from meshkit.batching import bounding_box_center, center
+from meshkit.batching import bounding_box_center, center, check_mask
 from meshkit.descriptors import intrinsic_descriptors
 from meshkit.models.generator import PoseTransferGenerator
 from meshkit.models.npt import NPT
 from meshkit.models.output import GeneratorOutput
 from meshkit.models.presets import GeneratorConfig
 
-_SMALLEST, _LARGEST = 0.1, 20.0  # extents of meshes, or of all poses of a batch together, that may be in metres
+_SMALLEST, _LARGEST = 0.1, 20.0  # longest sides of meshes that may be in metres
+_ANIMALS = {"animals", "smal"}  # whose unit is arbitrary
+_USUAL = {"people": (0.5, 2.6), "animals": (0.5, 4.0)}  # the shipped bodies' longest sides are .92-2.55 and .78-2.08
 
 __all__ = ["PretrainedTransfer", "load_pretrained", "pretrained_names"]
 
@@ -26,7 +29,10 @@ class PretrainedTransfer(nn.Module):
     """A generator that centres meshes, computes their descriptors itself, and puts the result where the pose mesh is.
 
     Meshes must stand in the frame that the weights were trained in: metres, z up, facing -y;
-    :func:`meshkit.transfer.transfer_pose` brings others there. Vertices are differentiable, descriptors are constants.
+    :func:`meshkit.transfer.transfer_pose` brings others there. Shipped weights warn of a mesh that is longer or shorter
+    than such bodies are. Vertices are differentiable. Constants are the
+    descriptors, the relative positions in set convolutions and the weights of the rigid moving least squares, so the
+    gradient to the vertices is not whole: ``docs/deviations.md``.
 
     Args:
         generator: :class:`PoseTransferGenerator` or :class:`NPT`.
@@ -38,12 +44,12 @@ class PretrainedTransfer(nn.Module):
 
     Shape:
         ``identity (V, 3)`` or ``(B, V, 3)``, ``pose (W, 3)`` or ``(B, W, 3)``; a single mesh beside a batch serves all
-        of it, and is described and encoded once. Faces ``(F, 3)``, or per mesh ``(B, F, 3)`` padded with -1. Result
-        ``(V, 3)`` if both are single meshes, else ``(B, V, 3)``.
+        of it, and is described and encoded once. Masks ``(V,)`` or ``(B, V)``. Faces ``(F, 3)``, or per mesh
+        ``(B, F, 3)`` padded with -1. Result ``(V, 3)`` if both are single meshes, else ``(B, V, 3)``.
 
     Raises:
-        ValueError: a size that cannot be metres (shipped weights), wrong shapes, unequal batches, fewer vertices than
-            the network looks at, or no faces where the weights use descriptors.
+        ValueError: a mesh whose size cannot be metres (shipped weights), wrong shapes, unequal batches, fewer vertices
+            than the network looks at, or no faces where the weights use descriptors.
 
     Example:
         >>> config = GeneratorConfig(extractor_widths=(8, 16), k=4, widths=(32, 16))
@@ -100,9 +106,10 @@ class PretrainedTransfer(nn.Module):
         batch = max(len(first["identity"]), len(second["pose"]))
         inputs = {name: _repeated(value, batch) for name, value in (first | second).items() if value is not None}
         result = self.generator(**inputs)
-        where = bounding_box_center(pose if pose.dim() == 3 else pose[None], pose_mask)
+        where = bounding_box_center(pose if pose.dim() == 3 else pose[None], second["pose_mask"])
         vertices = result.vertices + where
         warped = None if result.warped is None else result.warped + where
+        identity_mask = first["identity_mask"]
         if identity_mask is not None:
             vertices = vertices.masked_fill(~identity_mask[..., None], 0.0)
             warped = None if warped is None else warped.masked_fill(~identity_mask[..., None], 0.0)
@@ -133,9 +140,16 @@ class PretrainedTransfer(nn.Module):
         if verts.dim() not in (2, 3) or verts.shape[-1] != 3:
             raise ValueError(f"{name} must be (V, 3) or (B, V, 3), got {tuple(verts.shape)}")
         verts = (verts if verts.dim() == 3 else verts[None]).to(next(self.generator.parameters()).dtype)
-        real = verts.detach() if mask is None else verts.detach()[mask]
+        if isinstance(mask, Tensor) and mask.dim() == 1:
+            mask = mask[None]
+        check_mask(mask, *verts.shape[:2], name=f"{name}_mask")
         if self.card:
-            check_extent(real, name, advice="meshkit.transfer.transfer_pose brings others there")
+            advice = "meshkit.transfer.transfer_pose brings others there"
+            check_extent(verts.detach(), name, mask=mask, advice=advice)
+            odd = unusual_extent(verts.detach(), str(self.card.get("data")), mask=mask)
+            if odd is not None:
+                said = f"{name} is {odd:.3g} long; these weights were trained on bodies of about 1 to 2: {advice}"
+                warnings.warn(said, stacklevel=2)
         k = self.config.k if self.config.architecture == "matching" and self.config.extractor == "setconv" else 1
         if verts.shape[1] < k:
             raise ValueError(f"{name} has {verts.shape[1]} vertices; these weights look at {k} neighbours of each")
@@ -153,20 +167,32 @@ class PretrainedTransfer(nn.Module):
         return sides
 
 
-def extents(verts: Tensor) -> Tensor:
-    """Sides (3,) of the box along the axes around all vertices (..., 3); 0 if there are none."""
-    points = verts.reshape(-1, 3)
-    return points.amax(0) - points.amin(0) if len(points) else points.new_zeros(3)
+def extents(verts: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Sides (..., 3) of the box along the axes around each mesh (..., V, 3); 0 if it has no vertices."""
+    if verts.shape[-2] == 0:
+        return verts.new_zeros(*verts.shape[:-2], 3)
+    if mask is None:
+        return verts.amax(-2) - verts.amin(-2)
+    low, high = (torch.where(mask[..., None], verts, end) for end in (torch.inf, -torch.inf))
+    return (high.amax(-2) - low.amin(-2)).clamp_min(0)
 
 
-def check_extent(verts: Tensor, name: str, *, advice: str) -> None:
-    """Refuse a mesh whose longest side cannot be metres; ``advice`` says what can be done with it."""
-    extent = float(extents(verts).amax())
-    if not _SMALLEST < extent < _LARGEST:
-        raise ValueError(
-            f"{name} is {extent:.3g} long, but these weights take meshes of about 1 to 2 (metres, z up, facing -y): "
-            f"{advice}"
-        )
+def check_extent(verts: Tensor, name: str, *, advice: str, mask: Tensor | None = None) -> None:
+    """Refuse meshes (..., V, 3) if a longest side cannot be metres; ``advice`` says what can be done with them."""
+    sides = extents(verts, mask).amax(-1).flatten().tolist()
+    for number, side in enumerate(sides):
+        if not _SMALLEST < side < _LARGEST:
+            raise ValueError(
+                f"{name if len(sides) == 1 else f'{name} {number}'} is {side:.3g} long, but these weights take meshes "
+                f"of about 1 to 2 (metres, z up, facing -y): {advice}"
+            )
+
+
+def unusual_extent(verts: Tensor, data: str, mask: Tensor | None = None) -> float | None:
+    """The longest side of the first of meshes (..., V, 3) that no body of this kind of data has; None if all may be."""
+    low, high = _USUAL["animals" if data.partition(":")[0] in _ANIMALS else "people"]
+    sides = extents(verts, mask).amax(-1).flatten().tolist()
+    return next((side for side in sides if not low <= side <= high), None)
 
 
 def _repeated(value: Tensor, batch: int) -> Tensor:

@@ -53,7 +53,7 @@ def mirror_labels(
         ``(N,)`` bool, True where the mirrored match is the better one.
 
     Raises:
-        ValueError: shapes do not fit.
+        ValueError: shapes do not fit, positions are not finite, or ``faces`` or ``partner`` point to no vertex.
 
     Reference:
         Kolmogorov and Zabih, "What energy functions can be minimized via graph cuts?", 2004. Not part of the X-DualNet
@@ -77,6 +77,12 @@ def mirror_labels(
     if partner.shape != (num,):
         raise ValueError(f"partner must be ({num},), got {tuple(partner.shape)}")
     device = verts.device
+    for name, points in (("verts", verts), ("targets", targets), ("mirrored", mirrored)):
+        if not bool(points.isfinite().all()):
+            raise ValueError(f"{name} must be finite")
+    for name, index, low in (("faces", faces, -1), ("partner", partner, 0)):  # faces may be padded with -1
+        if index.numel() and not low <= int(index.min()) <= int(index.max()) < num:
+            raise ValueError(f"{name} must be in [0, {num}), got {int(index.min())} to {int(index.max())}")
     verts, targets, mirrored = (t.detach().double().cpu() for t in (verts, targets, mirrored))
     faces, partner = faces.cpu(), partner.cpu()
     i, j = unique_edges(faces).T

@@ -25,7 +25,8 @@ class SetConv(nn.Module):
     .. math:: y_i = \max_{j \in \mathrm{kNN}(i)} \phi_3\,\phi_2\,\phi_1\,[x_j,\; p_j - p_i], \qquad
               \phi_l(h) = \mathrm{LeakyReLU}_{0.1}(\mathrm{InstanceNorm}(W_l h))
 
-    with statistics over all (vertex, neighbour) pairs of a sample. The relative positions carry no gradient.
+    with statistics over all (vertex, neighbour) pairs of a sample. The relative positions carry no gradient, as in the
+    released code, unless ``relative_gradient`` asks for it; the choice of neighbours never does.
 
     The evaluation is exact but not literal. The first linear map is split, :math:`W_1 [x_j, p_j - p_i] = (W_x x_j +
     W_p p_j) - W_p p_i`: N products instead of N k. The statistics of its result follow from the covariance of
@@ -38,6 +39,7 @@ class SetConv(nn.Module):
         in_features: channels of ``x``.
         out_features: channels of the result.
         slope: of the LeakyReLU, not negative.
+        relative_gradient: ``p_j - p_i`` carries its gradient too, so that the one to the positions is whole.
         recompute: hold nothing of size N k between forward and backward, nor within them, at 1.7 times the matrix
             products; else one tensor ``(B, N k, out_features)`` is kept for the backward.
 
@@ -58,13 +60,22 @@ class SetConv(nn.Module):
         torch.Size([2, 50, 16])
     """
 
-    def __init__(self, in_features: int, out_features: int, *, slope: float = 0.1, recompute: bool = False) -> None:
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        slope: float = 0.1,
+        recompute: bool = False,
+        relative_gradient: bool = False,
+    ) -> None:
         super().__init__()
         if not slope >= 0:
             raise ValueError(f"slope must not be negative (the maximum is taken before the activation), got {slope}")
         if in_features < 1 or out_features < 1:
             raise ValueError(f"in_features and out_features must be positive, got {in_features}, {out_features}")
         self.slope, self.in_features, self.out_features, self.recompute = slope, in_features, out_features, recompute
+        self.relative_gradient = relative_gradient
         widths = [in_features + 3, out_features, out_features, out_features]
         self.linears = nn.ModuleList(nn.Linear(i, o, bias=False) for i, o in pairwise(widths))
         self.scales = nn.ParameterList(nn.Parameter(torch.ones(out_features)) for _ in self.linears)
@@ -72,7 +83,7 @@ class SetConv(nn.Module):
 
     def extra_repr(self) -> str:
         """Options in the printed module."""
-        return f"{self.in_features}, {self.out_features}, {settings(self, 'slope', 'recompute')}"
+        return f"{self.in_features}, {self.out_features}, {settings(self, 'slope', 'recompute', 'relative_gradient')}"
 
     def forward(
         self, x: Tensor, positions: Tensor, neighbors: Tensor | Neighborhoods, *, mask: Tensor | None = None
@@ -85,7 +96,7 @@ class SetConv(nn.Module):
             graph = neighbors
         else:
             _check_graph(x, positions, neighbors, mask)
-            graph = neighborhoods(positions, neighbors, mask)
+            graph = neighborhoods(positions, neighbors, mask, gradient=self.relative_gradient)
         kind = x.device.type
         products = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else x.dtype
         with torch.autocast(kind, enabled=False):
@@ -150,9 +161,11 @@ class Neighborhoods(NamedTuple):
     covariance: Tensor  # (B, 3, 3), of d
 
 
-@torch.no_grad()
-def neighborhoods(positions: Tensor, neighbors: Tensor, mask: Tensor | None) -> Neighborhoods:
+def neighborhoods(
+    positions: Tensor, neighbors: Tensor, mask: Tensor | None, *, gradient: bool = False
+) -> Neighborhoods:
     """What :class:`SetConv` needs to know of its graph."""
+    positions = positions if gradient else positions.detach()
     with torch.autocast(positions.device.type, enabled=False):
         return _neighborhoods(positions.to(torch.promote_types(positions.dtype, torch.float32)), neighbors, mask)
 
@@ -187,6 +200,7 @@ class SetConvExtractor(nn.Module):
         k: neighbours of each vertex, itself included; the released code has 32.
         descriptors: number of descriptor channels appended to the coordinates at the input.
         recompute: as in :class:`SetConv`.
+        relative_gradient: likewise.
 
     Shape:
         ``positions (B, N, 3)``, ``descriptors (B, N, D)`` or ``None``, ``mask (B, N)``; result ``(B, N, widths[-1])``.
@@ -201,18 +215,26 @@ class SetConvExtractor(nn.Module):
     """
 
     def __init__(
-        self, widths: Sequence[int] = (32, 64, 128), *, k: int = 32, descriptors: int = 0, recompute: bool = False
+        self,
+        widths: Sequence[int] = (32, 64, 128),
+        *,
+        k: int = 32,
+        descriptors: int = 0,
+        recompute: bool = False,
+        relative_gradient: bool = False,
     ) -> None:
         super().__init__()
         if not widths or min(widths) < 1:
             raise ValueError(f"widths must be at least one positive number of channels, got {tuple(widths)}")
         self.k, self.descriptors, self.out_features = k, descriptors, widths[-1]
         inputs = [3 + descriptors, *widths[:-1]]
-        self.convs = nn.ModuleList(SetConv(i, o, recompute=recompute) for i, o in zip(inputs, widths, strict=True))
+        options = {"recompute": recompute, "relative_gradient": relative_gradient}
+        self.relative_gradient = relative_gradient
+        self.convs = nn.ModuleList(SetConv(i, o, **options) for i, o in zip(inputs, widths, strict=True))
 
     def extra_repr(self) -> str:
         """Options in the printed module."""
-        return settings(self, "k", "descriptors")
+        return settings(self, "k", "descriptors", "relative_gradient")
 
     def forward(self, positions: Tensor, *, descriptors: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Features of each vertex."""
@@ -239,7 +261,8 @@ class SetConvExtractor(nn.Module):
             )
         if mask is not None:
             positions = positions.masked_fill(~mask[..., None], 0.0)
-        graph = neighborhoods(positions, knn(positions, self.k, mask=mask), mask)
+        neighbors = knn(positions.detach(), self.k, mask=mask)
+        graph = neighborhoods(positions, neighbors, mask, gradient=self.relative_gradient)
         x = positions
         if descriptors is not None:
             if mask is not None:

@@ -1,5 +1,6 @@
 """Moving pictures: bodies that turn, and sequences of frames, as GIF files."""
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -59,8 +60,9 @@ def save_animation(
     if 0 in first or any(p.dtype != np.uint8 or p.shape != first or p.shape[2:] != (3,) for p in pictures):
         kinds = sorted({f"{p.dtype} {p.shape}" for p in pictures})
         raise ValueError(f"frames must be uint8 (H, W, 3) of one size, got {', '.join(kinds)}")
-    step = max(1, len(pictures) // 8)
-    palette = Image.fromarray(np.concatenate(pictures[::step])).quantize(256, method=Image.Quantize.MEDIANCUT)
+    step = math.ceil(math.sqrt(len(pictures) / 8))  # of rows and columns: the pixels of 8 frames are enough
+    seen = np.concatenate([p[::step, ::step] for p in pictures])
+    palette = Image.fromarray(seen).quantize(256, method=Image.Quantize.MEDIANCUT)
     images = [Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     options: dict[str, Any] = {"loop": 0} if loop else {}
     with atomic_write(path) as temporary:
@@ -75,6 +77,7 @@ def turntable(
     *,
     frames: int = 36,
     size: tuple[int, int] = (240, 320),
+    azimuth: float = 0.0,
     elevation: float = 8.0,
     up: Literal["y", "z"] = "z",
     **options: Any,
@@ -88,6 +91,7 @@ def turntable(
         faces: (F, 3) vertex indices.
         frames: number of pictures in one turn.
         size: width and height in pixels.
+        azimuth: degrees at which the turn begins; 0 looks at the front.
         elevation: degrees above the horizon.
         up: the vertical axis.
         options: further keywords of :func:`meshkit.viz.render`, such as ``colors`` or ``shading``.
@@ -120,6 +124,6 @@ def turntable(
     half[upright] = (high - low)[upright] / 2
     view = {"scale": float(scale) or 1.0, "bounds": np.stack([middle - half, middle + half]), **options}
     return [
-        render(points, triangles, azimuth=360 * i / frames, elevation=elevation, up=up, size=size, **view)
+        render(points, triangles, azimuth=azimuth + 360 * i / frames, elevation=elevation, up=up, size=size, **view)
         for i in range(frames)
     ]
