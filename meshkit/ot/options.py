@@ -26,12 +26,16 @@ KEEP_BYTES = 1 << 30
 
 
 class Options(NamedTuple):
-    """Options of :func:`sinkhorn`, read and checked."""
+    """Options of :func:`sinkhorn`, read and checked.
+
+    With ``dual`` the potentials are constants, ``"between"`` two sets or ``"within"`` one: see :mod:`meshkit.ot.dual`.
+    """
 
     eps: float | Tensor
     settings: Settings
     domain: Domain
     store: Store
+    dual: Literal["between", "within"] | None = None
 
     @property
     def unbalanced(self) -> bool:

@@ -36,7 +36,13 @@ def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, *given: Tenso
     settings, store = options.settings, options.store
     if not launch_bound(fx) or cost != "cosine" or any(tensor is not None for tensor in given):
         return False
-    if options.unbalanced or settings.tol is not None or settings.scales or settings.grad not in ("unroll", "none"):
+    if (
+        options.dual
+        or options.unbalanced
+        or settings.tol is not None
+        or settings.scales
+        or settings.grad not in ("unroll", "none")
+    ):
         return False
     (batch, rows, _), columns, dtype = fx.shape, fy.shape[1], torch.promote_types(fx.dtype, torch.float32)
     if options.domain == "log" or store == "stream":
