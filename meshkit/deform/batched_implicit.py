@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 from meshkit.deform.batched_objective import BatchedObjective
 from meshkit.deform.batched_rotation import Differential
 from meshkit.deform.implicit import SADDLE
+from meshkit.deform.options import warn_unconverged
 from meshkit.topology import cotangent_weights
 
 __all__ = ["BatchedImplicit"]
@@ -31,10 +32,13 @@ class BatchedImplicit(torch.autograd.Function):
         objective: BatchedObjective,
         tol: float,
         negative_curvature: Tensor,
+        residual: Tensor,
+        forward_tol: float,
     ) -> Tensor:
         """Return the minima. All positions are about the origins of their meshes."""
         ctx.save_for_backward(x, soft_targets)
         ctx.objective, ctx.tol, ctx.negative_curvature = objective, tol, negative_curvature
+        ctx.ended = residual, forward_tol
         return x.clone()
 
     @staticmethod
@@ -58,9 +62,11 @@ class BatchedImplicit(torch.autograd.Function):
         ctx.negative_curvature |= negative.view_as(ctx.negative_curvature)
         if bool(negative.any()):
             warnings.warn(SADDLE, stacklevel=2)
+        residual, forward_tol = ctx.ended
+        warn_unconverged(float(residual.amax()), forward_tol)
         change = turned(adjoint)
         wanted = ctx.needs_input_grad
-        grads: list[Tensor | None] = [None] * 8
+        grads: list[Tensor | None] = [None] * 10
         if wanted[0]:
             grads[0] = -_stationarity_gradient(objective, x, adjoint, R, change)
         if wanted[1]:
