@@ -7,7 +7,7 @@ import ot
 import pytest
 import torch
 from conftest import GARBAGE, assert_near, rand, scatter, scattered_mask
-from literal_ot import algorithm_1, cost_matrix, costs, leaves, literal_batch, weights
+from literal_ot import algorithm_1, cost_matrix, costs, leaves, literal_batch, one_by_one, weights  # noqa: F401
 from torch import Tensor
 from torch.autograd import gradcheck
 

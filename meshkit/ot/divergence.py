@@ -12,7 +12,7 @@ from torch import Tensor
 from meshkit._compile import uncompiled
 from meshkit.batching import check_mask
 from meshkit.ot.costs import logit_features
-from meshkit.ot.options import Cost, Domain, Store, check_choice, read_options
+from meshkit.ot.options import Cost, Domain, Store, check_choice, plain, read_options
 from meshkit.ot.sample import SamplePlan
 from meshkit.ot.sinkhorn import check_features, eps_schedule, solve_features
 
@@ -98,6 +98,7 @@ def sinkhorn_divergence(
         9.0
     """
 
+    eps, n_iters = plain(eps), plain(n_iters)
     if not isinstance(eps, int | float):
         raise ValueError(f"eps must be a number, got {type(eps).__name__}; use anneal to lower it in steps")
 

@@ -79,9 +79,9 @@ def sinkhorn(
         domain: ``"kernel"`` iterates on :math:`K` (fast), ``"log"`` on its logarithm (safe at any ``eps``), ``"auto"``
             takes the kernel where the range of the dtype allows: for uniform weights and the cosine cost
             ``eps >= 2 / (log(max) - log(N M))``, .0282 for 6890 x 6890 in float32. A plan forced into the kernel domain
-            below that may be NaN. On a GPU, samples of one size (cosine cost, no masks, weights, ``tol`` or
-            ``check_finite``) are solved together in the kernel domain where that is allowed; else float32 features go
-            through Triton kernels, which always work in the log domain.
+            below that may be NaN. On a GPU, and on a CPU up to 65,536 entries each, samples of one size (cosine cost,
+            no masks, weights, ``tol`` or ``check_finite``) are solved together in the kernel domain where that is
+            allowed; else float32 features on a GPU go through Triton kernels, which always work in the log domain.
         store: ``"keep"`` holds K for all later sweeps and the backward pass, N x M numbers per sample; ``"stream"``
             computes it again, in :math:`O((N + M) D)` memory; ``"auto"`` keeps up to 1 GiB, on a GPU up to 128 MiB. A
             kept K lives as long as the plan or the graph of its readings. Triton kernels always stream; the
@@ -309,6 +309,7 @@ def solve(
         index_x=sides.index_x,
         index_y=sides.index_y,
         n_iters=solution.n_iters,
+        centred=options.settings.grad == "implicit" and not options.unbalanced,
     )
 
 
