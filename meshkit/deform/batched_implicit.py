@@ -7,15 +7,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from meshkit.deform.batched_objective import BatchedObjective
+from meshkit.deform.batched_objective import LOOK, BatchedObjective
 from meshkit.deform.batched_rotation import Differential
 from meshkit.deform.implicit import SADDLE
 from meshkit.deform.options import warn_unconverged
 from meshkit.topology import cotangent_weights
 
 __all__ = ["BatchedImplicit"]
-
-_LOOK = 8  # iterations between two looks at what is done
 
 
 class BatchedImplicit(torch.autograd.Function):
@@ -88,7 +86,7 @@ def _solve(objective: BatchedObjective, product: Any, grad: Tensor, tol: float) 
     negative = torch.zeros_like(square, dtype=torch.bool)
     for iteration in range(500):
         done = (square <= tol * tol * first) | negative
-        if iteration % _LOOK == 0 and bool(done.all()):
+        if iteration % LOOK == 0 and bool(done.all()):
             break
         image = torch.where(objective.free, product(direction), 0.0)
         curvature = per_mesh(direction * image)
