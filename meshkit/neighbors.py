@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from meshkit._numerics import launch_bound
+from meshkit._numerics import launch_bound, safe_sqrt
 from meshkit.batching import check_mask
 
 __all__ = ["gather_vertices", "knn"]
 
 _TILE_ELEMENTS = 1 << 22  # distances held at once by the tiled search: 16 MiB in float32
+_SMALL = 128 * 128  # distances of a sample, up to which tiles are faster than a tree on a CPU
 _OTHER_TILE_ELEMENTS = 1 << 26  # elsewhere than on a CPU
 
 
@@ -39,7 +40,8 @@ def knn(
             but meaningless indices.
         include_self: False to search the k nearest others of each point; for the points themselves as queries.
         method: ``"tree"`` (SciPy's KD-tree, CPU), ``"tiles"`` (blocks of the distance matrix, any device) or
-            ``"auto"``: the tree on the CPU, tiles elsewhere.
+            ``"auto"``: the tree on the CPU for more than 128 x 128 distances per sample, below which setting up a
+            tree takes longer; tiles elsewhere.
 
     Returns:
         ``(B, Q, k)`` int64.
@@ -72,7 +74,8 @@ def knn(
     points = points.detach().to(dtype)
     query = points if query is None else query.detach().to(dtype)
     if method == "auto":
-        method = "tree" if points.device.type == "cpu" else "tiles"
+        many = points.shape[1] * query.shape[1] > _SMALL
+        method = "tree" if many and points.device.type == "cpu" else "tiles"
     search = _knn_tree if method == "tree" else _knn_tiles
     return search(points, query, k, mask, include_self)
 
@@ -128,6 +131,20 @@ def _squared_distances(query: Tensor, points: Tensor) -> Tensor:
         difference = a[:, :, None] - b[:, None]
         total.addcmul_(difference, difference)
     return total
+
+
+def distance_to_nearest(
+    points: Tensor, others: Tensor, mask: Tensor | None, others_mask: Tensor | None, *, squared: bool
+) -> Tensor:
+    """Distance ``(B, N)`` of each point to the nearest of the others, 0 where masked.
+
+    Found without a gradient, and taken again from the index with one.
+    """
+    difference = points - gather_vertices(others, knn(others, 1, query=points, mask=others_mask)[..., 0])
+    if mask is not None:
+        difference = torch.where(mask[..., None], difference, 0)
+    distance = difference.square().sum(2)
+    return distance if squared else safe_sqrt(distance)
 
 
 def gather_vertices(x: Tensor, index: Tensor) -> Tensor:

@@ -203,6 +203,41 @@ def test_unrolled_and_implicit_gradients_meet_at_the_minimum_and_not_before() ->
     assert error > 1e-2
 
 
+@pytest.mark.parametrize("solver", ["auto", "dense"])
+def test_preset_is_differentiated_as_it_ran(solver: str) -> None:
+    """50 iterations of local-global are no minimum; asking for its gradient there is answered with a warning."""
+    verts, faces = ellipsoid()
+    handles, weight = torch.tensor([0, 20, 31]), randn(*verts.shape, seed=9)
+    goal, direction = verts[handles] + 0.3 * randn(3, 3), randn(3, 3, seed=4)
+
+    def loss(pos: torch.Tensor, **options: Any) -> torch.Tensor:
+        preset = PRESETS["xdualnet"] | {"solver": solver, "max_iter": 5} | options
+        return (arap_deform(verts, faces, handles, pos, **preset)[0] * weight).sum()
+
+    pos = goal.clone().requires_grad_()
+    along = (torch.autograd.grad(loss(pos), pos)[0] * direction).sum()
+    difference = (loss(goal + 1e-5 * direction) - loss(goal - 1e-5 * direction)) / 2e-5
+    assert along.item() == pytest.approx(difference.item(), rel=1e-5)
+    with pytest.warns(UserWarning, match="exact at a minimum only, and the deformation ended at a residual above 1e-"):
+        implicit = torch.autograd.grad(loss(pos, grad="implicit"), pos)[0]
+    assert abs((implicit * direction).sum() - along) > 1e-3 * abs(along)
+
+
+def test_unrolling_refuses_what_it_would_leave_out() -> None:
+    verts, faces = ellipsoid()
+    handles, weights = torch.tensor([0, 20, 31]), torch.ones(len(verts), dtype=verts.dtype)
+    rest, options = verts.clone().requires_grad_(), {"method": "local_global", "grad": "unroll", "max_iter": 2}
+    with pytest.raises(ValueError, match=r'no gradient for verts: detach\(\) them or take grad="implicit"'):
+        arap_deform(rest, faces, handles, verts[handles], **options)
+    soft = {"soft_targets": verts, "soft_weights": weights.requires_grad_()}
+    with pytest.raises(ValueError, match="no gradient for soft_weights"):
+        arap_deform(verts, faces, handles, verts[handles], **soft, **options)
+    with pytest.raises(ValueError, match="no gradient for rest"):
+        ARAPDeformer(grad="unroll")(rest, verts, faces)
+    with torch.no_grad():
+        assert ARAPDeformer(grad="unroll")(rest, verts, faces).isfinite().all()
+
+
 def test_a_saddle_is_reported() -> None:
     # A strip turned over and pressed together stops at a state that a forward pass of one step cannot leave.
     verts, faces = ellipsoid()
@@ -319,7 +354,7 @@ def test_deformer_is_implicit_and_follows_presets() -> None:
     x.square().sum().backward()
     assert module.info is not None and module.info.converged
     assert rest.grad.abs().sum() > 0 and target.grad.abs().sum() > 0
-    paper = ARAPDeformer(**PRESETS["xdualnet"], grad="none")
+    paper = ARAPDeformer(**(PRESETS["xdualnet"] | {"grad": "none"}))
     assert repr(paper) == repr(ARAPDeformer(energy="spokes", max_iter=50, grad="none"))
     assert "method='local_global', max_iter=50, tol=0.0" in repr(paper)
     assert "local_global" in repr(ARAPDeformer(grad="unroll"))
@@ -333,7 +368,7 @@ def test_set_up_stays_on_the_cpu_whatever_the_default_device() -> None:
     torch.set_default_device("meta")  # any tensor made there would be without data
     try:
         for options in ({}, {"method": "local_global", "grad": "unroll", "max_iter": 3}, {"method": "local_global"}):
-            x, _ = arap_deform(rest, faces, handles, pos, **options)
+            x, _ = arap_deform(rest.detach() if options.get("grad") else rest, faces, handles, pos, **options)
             assert x.device.type == "cpu" and x.isfinite().all()
         module(rest, rest.detach(), faces).sum().backward()
         assert arap_energy(rest, faces, x.detach()).isfinite()

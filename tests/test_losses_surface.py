@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
-from meshkit import losses, metrics
+from meshkit import _connectivity, losses, metrics
 from meshkit.batching import pad, pad_faces
 from meshkit.deform import arap_energy as arap_energy_of_deform
 from meshkit.losses import (
@@ -22,7 +22,6 @@ from meshkit.losses import (
     LaplacianLoss,
     NormalConsistencyLoss,
     SinkhornDivergenceLoss,
-    _connectivity,
     arap_energy,
     chamfer_loss,
     edge_length_loss,
@@ -317,7 +316,7 @@ def test_edges_are_found_once_for_a_tensor_of_faces_and_anew_when_it_changes(mon
         edge_length_loss(verts[:, :3], faces)
     each = STRIP.expand(2, -1, -1).clone()
     edge_length_loss(verts, each)
-    with pytest.raises(ValueError, match="batch size of verts"):
+    with pytest.raises(ValueError, match="batch size of the vertices"):
         edge_length_loss(verts[:1], each)
 
 
@@ -377,7 +376,7 @@ NONE = torch.zeros(2, 5, dtype=torch.bool)
         (lambda: LaplacianLoss(reduction="avg"), "reduction"),
         (lambda: normal_consistency_loss(V, STRIP, reduction="avg"), "reduction"),
         (lambda: normal_consistency_loss(V[0], STRIP), "verts must"),
-        (lambda: normal_consistency_loss(V, STRIP.expand(3, -1, -1)), "batch size of verts"),
+        (lambda: normal_consistency_loss(V, STRIP.expand(3, -1, -1)), "batch size of the vertices"),
         (lambda: normal_consistency_loss(V, STRIP, mask=NONE[:, :4]), r"mask must have shape \(2, 5\)"),
         (lambda: NormalConsistencyLoss(reduction="avg"), "reduction"),
         (lambda: chamfer_loss(V, V, reduction="avg"), "reduction"),

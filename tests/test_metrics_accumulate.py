@@ -53,6 +53,20 @@ def test_metrics_of_other_arguments():
     torch.testing.assert_close(error.compute(), expected)
 
 
+def test_options_are_checked_where_they_are_given():
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'squared': options of pmd are pred, target"):
+        metrics.PMD(squared=False)
+    metrics.MeanMetric(lambda pred, **options: pred, anything=1)
+    metrics.MeanMetric(max)  # has no signature
+
+
+def test_printed_metric():
+    metric = metrics.EdgeRatio(faces=FACES, min_length=0.1)
+    metric.update(rand(3, 4, 3), rand(3, 4, 3, seed=1))
+    assert repr(metric) == "EdgeRatio(faces=tensor(4, 3), min_length=0.1): 3 samples"
+    assert repr(metrics.MeanMetric(metrics.pmd)) == "MeanMetric(pmd): 0 samples"
+
+
 def test_options_of_a_call_come_first():
     metric = metrics.ChamferDistance(squared=False)
     metric.update(torch.zeros(1, 1, 3), torch.full((1, 1, 3), 2.0), squared=True)

@@ -38,6 +38,17 @@ def test_knn_equals_argsort(k, coordinates, dtype, method, tile_elements):
     assert torch.equal(index[..., 0], torch.arange(60).expand(2, -1))  # itself first
 
 
+def test_small_samples_are_searched_in_tiles(monkeypatch):
+    """Setting up a tree per sample takes longer there, whatever the number of samples."""
+    chosen = []
+    for name in ("_knn_tree", "_knn_tiles"):
+        search = getattr(neighbors, name)
+        monkeypatch.setattr(neighbors, name, lambda *a, search=search, name=name: chosen.append(name) or search(*a))
+    for batch, num, queries in ((9, 128, 128), (1, 64, 256), (1, 129, 128)):
+        knn(rand(batch, num, 3), 1, query=rand(batch, queries, 3, seed=1))
+    assert chosen == ["_knn_tiles", "_knn_tiles", "_knn_tree"]
+
+
 @methods
 def test_query_points(method, tile_elements):
     points, query = rand(2, 40, 3), rand(2, 25, 3, seed=1)

@@ -689,7 +689,7 @@ def test_a_printed_norm_shows_its_options(norm, said):
 
 def modulation_inputs(features: bool, linear: bool, *, num: int = 11) -> list[Tensor | None]:
     """x, mean, scale and shift bias, features, scale and shift weight, weight, bias."""
-    b, c, d, o = 2, 4, 3, 5
+    b, c, d, o = 3, 4, 3, 5
     shapes: list[tuple[int, ...] | None] = [(b, num, c), (b, 1, c), (b, 1, c), (b, 1, c)]
     shapes += [(b, num, d), (b, d, c), (b, d, c)] if features else [None] * 3
     shapes += [(o, c), (o,)] if linear else [None] * 2
@@ -718,7 +718,7 @@ forms = pytest.mark.parametrize(
 
 
 @forms
-@pytest.mark.parametrize("rows", [4, 11, 512, None])
+@pytest.mark.parametrize("rows", [4, 11, 23, 512, None])
 def test_modulate_in_tiles_of_any_size(features, linear, slope, rows, monkeypatch):
     monkeypatch.setattr(_tiles, "launch_bound", lambda x: rows is None)
     monkeypatch.setattr(_tiles, "ROWS", rows)
@@ -728,6 +728,15 @@ def test_modulate_in_tiles_of_any_size(features, linear, slope, rows, monkeypatc
     given, upstream = [t for t in inputs if t is not None], rand(*value.shape, seed=20)
     for gradient, truth in zip(*(torch.autograd.grad(v, given, upstream) for v in (value, expected)), strict=True):
         assert_near(gradient, truth, 1e-12)
+
+
+def test_tiles_on_a_cpu_span_small_samples():
+    walks = {shape: [t for t in _tiles.tiles(torch.empty(shape))] for shape in ((5, 200, 2), (2, 600, 2), (1, 9, 2))}
+    everything = slice(None)
+    assert walks[5, 200, 2] == [(slice(0, 2), everything), (slice(2, 4), everything), (slice(4, 5), everything)]
+    assert walks[2, 600, 2] == [(b, rows) for b in range(2) for rows in (slice(0, 512), slice(512, 600))]
+    assert walks[1, 9, 2] == [(0, slice(0, 9))]
+    assert len(_tiles.tile_buffer(torch.empty(5, 200, 2), torch.float32)) == 2
 
 
 @forms

@@ -1,15 +1,17 @@
 """Sinkhorn divergence, matching with a dustbin and the modules, each against its equation on stored matrices."""
 
 import math
+import warnings
 
 import ot
 import pytest
 import torch
 from conftest import GARBAGE, assert_near, rand, scatter, scattered_mask
-from literal_ot import algorithm_1, cost_matrix, costs, leaves, literal_batch, weights
+from literal_ot import algorithm_1, cost_matrix, costs, leaves, literal_batch, one_by_one, weights  # noqa: F401
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from meshkit.data import load_humans
 from meshkit.ot import (
     CorrespondenceWarp,
     SinkhornCorrespondence,
@@ -98,6 +100,46 @@ def test_divergence_at_small_eps_is_the_exact_cost():
     matrix = cost_matrix(x[0], y[0], "sqeuclidean").numpy()
     value = sinkhorn_divergence(x, y, eps=0.01, n_iters=500)
     assert value.item() == pytest.approx(ot.emd2([], [], matrix), rel=0.02)
+
+
+def converged_plan(x: Tensor, y: Tensor, eps: float, n_iters: int) -> Tensor:
+    """Of equal weights, by the plain iterations on the logarithm."""
+    logits = -torch.cdist(x, y).square() / eps
+    f, shape = torch.zeros(len(x), dtype=x.dtype), (math.log(len(x)), math.log(len(y)))
+    for _ in range(n_iters):
+        g = -torch.logsumexp(logits + f[:, None], 0) - shape[1]
+        f = -torch.logsumexp(logits + g, 1) - shape[0]
+    plan = (logits + f[:, None] + g).exp()
+    assert (len(y) * plan.sum(0) - 1).abs().mean() < 1e-5
+    return plan
+
+
+def test_default_gradient_of_an_elongated_shape_is_converged():
+    """Two bodies, whose plain iterations are slow: after 100 of each term the gradient would be 10 % off."""
+    x, y = load_humans(1000)(torch.tensor([0, 1]), torch.tensor([0, 7]))[:, None, ::12].unbind()
+    near = x.clone().requires_grad_()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (gradient,) = torch.autograd.grad(sinkhorn_divergence(near, y).sum(), near)
+    x, y = x[0].double(), y[0].double()
+    # At the optimum the gradient of a term is that of <T, C> with T held; of the self term both sides move.
+    across, within = (converged_plan(x, other, 0.01, 2500) for other in (y, x))
+    expected = 2 * (across.sum(1, keepdim=True) * x - across @ y) - 2 * (within.sum(1, keepdim=True) * x - within @ x)
+    assert_near(gradient[0].double(), expected, 1e-3)
+    with pytest.warns(UserWarning, match="n_iters ended before tol was met"):
+        sinkhorn_divergence(near, y[None].float(), n_iters=20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sinkhorn_divergence(near, y[None].float(), n_iters=20, tol=None)
+
+
+@pytest.mark.parametrize("domain", ["auto", "kernel"])
+def test_divergence_is_the_same_in_both_domains(domain):
+    """With weights, masks, and sets so far apart that the relaxed potentials start far off."""
+    x, y, a, b = rand(2, 20, 3), rand(2, 17, 3, seed=1) + 1.0, weights(2, 20), weights(2, 17, seed=1)
+    options = {"eps": 1.0, "a": a, "b": b, "n_iters": 3000, "tol": 1e-11}
+    expected = sinkhorn_divergence(x, y, anneal=None, domain="log", **options)
+    assert_near(sinkhorn_divergence(x, y, domain=domain, **options), expected, 1e-9)
 
 
 @pytest.mark.parametrize("garbage", GARBAGE)

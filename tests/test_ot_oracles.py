@@ -8,7 +8,7 @@ import ot
 import pytest
 import torch
 from conftest import assert_near, rand, scattered_mask
-from literal_ot import cost_matrix, domains, leaves, weights
+from literal_ot import cost_matrix, domains, leaves, one_by_one, weights  # noqa: F401
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 

@@ -7,13 +7,14 @@ import weakref
 import pytest
 import torch
 from conftest import assert_near, rand, scattered_mask
-from literal_ot import (
+from literal_ot import (  # noqa: F401
     READINGS,
     algorithm_1,
     cost_matrix,
     domains,
     leaves,
     literal_batch,
+    one_by_one,
     readings,
     set_rows,
 )

@@ -5,13 +5,22 @@ import math
 import re
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from conftest import assert_near, rand
-from literal_ot import DOMAINS, READINGS, algorithm_1, cost_matrix, domains, leaves
+from literal_ot import DOMAINS, READINGS, algorithm_1, cost_matrix, domains, leaves, one_by_one  # noqa: F401
 from torch import Tensor
 
-from meshkit.ot import eps_schedule, sinkhorn, sinkhorn_from_cost, sinkhorn_warp
+from meshkit.ot import (
+    SinkhornCorrespondence,
+    eps_schedule,
+    sinkhorn,
+    sinkhorn_divergence,
+    sinkhorn_from_cost,
+    sinkhorn_warp,
+)
+from meshkit.ot.iterations import conjugate_gradient
 
 grads = pytest.mark.parametrize("grad", ["unroll", "last_step", "implicit"])
 
@@ -494,6 +503,62 @@ def test_implicit_gradient_of_one_potential_leaves_its_free_constant_out(domain)
     for gradient, centred, truth in zip(*gradients, truths, strict=True):
         assert_near(centred, truth, 1e-9)
         assert_near(gradient, truth, 1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_implicit_gradient_of_the_free_constant_is_zero(seed, dtype):
+    """The sum of the column potentials is that constant: what is left of it after projection is rounding noise."""
+    fx, fy = (t.detach().to(dtype).requires_grad_() for t in leaves((1, 12, 3), (1, 9, 3), seed=seed))
+    options = {"eps": 0.3, "n_iters": 1000, "tol": 1e-14}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        g = sinkhorn(fx, fy, grad="implicit", **options).potentials[1]
+        gradients = torch.autograd.grad(g.sum(), [fx, fy])
+    g = sinkhorn(fx, fy, **options).potentials[1]
+    scale = max(t.abs().amax().item() for t in torch.autograd.grad(g.sum(), [fx, fy], retain_graph=True))
+    truths = torch.autograd.grad((g - g.mean()).sum(), [fx, fy])
+    for gradient, truth in zip(gradients, truths, strict=True):
+        assert_near(gradient, truth, 1e-5 if dtype == torch.float32 else 1e-12, scale=scale)
+
+
+def test_implicit_system_is_solved_relative_to_what_was_projected():
+    """Noise of the size that projecting leaves is answered with 0, and no step is taken along no curvature."""
+    noise = 1e-9 * rand(5, dtype=torch.float32)
+    assert not conjugate_gradient(lambda z: 0 * z, noise, torch.tensor(1.0)).any()
+    assert not conjugate_gradient(lambda z: 0 * z, noise, noise.norm()).any()
+
+
+@domains
+def test_implicit_potentials_are_given_and_differentiated_in_one_gauge(domain):
+    """Those of the columns have mean 0 under their weights, and so do their changes."""
+    fx, fy, logits = leaves((1, 7, 3), (1, 5, 3), (1, 5))
+    readings, b = [], logits.softmax(1)
+    for grad in ("implicit", "unroll"):
+        f, g = sinkhorn(fx, fy, b=b, eps=0.5, n_iters=300, tol=1e-13, grad=grad, domain=domain).potentials
+        mean = (b * g).sum()
+        if grad == "implicit":
+            assert abs(mean) < 1e-12
+            mean = torch.zeros_like(mean)
+        readings.append(((f + mean).square().sum() + (g - mean).pow(3).sum(), [fx, fy, logits]))
+    gradients, truths = (torch.autograd.grad(value, inputs, retain_graph=True) for value, inputs in readings)
+    assert_near(readings[0][0], readings[1][0].detach(), 1e-10)
+    for gradient, truth in zip(gradients, truths, strict=True):
+        assert_near(gradient, truth, 1e-8)
+
+
+def test_numpy_numbers_are_numbers():
+    options = {"n_iters": np.int64(30), "eps": np.float32(0.5), "reach": np.float64(2.0), "tol": np.float32(1e-3)}
+    plan = sinkhorn(X, X, **options)
+    assert torch.equal(
+        plan.dense(), sinkhorn(X, X, n_iters=30, eps=0.5, reach=2.0, tol=float(np.float32(1e-3))).dense()
+    )
+    falling = np.linspace(1.0, 0.5, 6)
+    assert torch.equal(sinkhorn(X, X, eps=falling).dense(), sinkhorn(X, X, eps=falling.tolist()).dense())
+    assert sinkhorn_divergence(X, X + 1, eps=np.float32(0.5), n_iters=np.int64(50)).isfinite().all()
+    assert SinkhornCorrespondence(eps=np.float32(0.5), reach=(np.float32(1.0), None))(X, X).n_iters == [5] * len(X)
+    with pytest.raises(ValueError, match=r"n_iters must be an integer of at least 1, got '5'"):
+        sinkhorn(X, X, n_iters="5")
 
 
 def test_features_must_be_floating_point_tensors():

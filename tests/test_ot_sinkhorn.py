@@ -5,7 +5,7 @@ import warnings
 import pytest
 import torch
 from conftest import GARBAGE, assert_near, rand, scatter, scattered_mask
-from literal_ot import (
+from literal_ot import (  # noqa: F401
     DOMAINS,
     algorithm_1,
     compare,
@@ -14,6 +14,7 @@ from literal_ot import (
     domains,
     leaves,
     literal_batch,
+    one_by_one,
     set_rows,
     weights,
 )

@@ -7,7 +7,7 @@ from conftest import assert_near, rand
 from torch.autograd import gradcheck
 
 from meshkit.losses import backward_correspondence_loss
-from meshkit.ot import TransportPlan, sinkhorn, stacked
+from meshkit.ot import TransportPlan, sinkhorn, sinkhorn_from_cost, stacked
 from meshkit.ot.sample import SamplePlan
 
 
@@ -53,6 +53,7 @@ def test_readings_and_gradients_equal_the_loop(name, sizes, n_iters, monkeypatch
     results = []
     for bound in (True, False):
         monkeypatch.setattr(stacked, "launch_bound", lambda x, bound=bound: bound)
+        monkeypatch.setattr(stacked, "SMALL", 0)
         fx, fy, v, w = (t.clone().requires_grad_() for t in inputs)
         plan = sinkhorn(fx, fy, eps=0.1, n_iters=n_iters)
         assert is_stacked(plan) == bound
@@ -102,6 +103,31 @@ def test_indices_and_matchings(together):
         assert matches.tolist() == [order.argsort().tolist()] * 2
     assert plan.mutual()[1].all()
     assert "n_iters=[20, 20]" in repr(plan) and plan.dtype == torch.float64 and plan.device.type == "cpu"
+
+
+def test_small_samples_are_solved_together_on_the_cpu_too():
+    fx, fy = rand(3, 8, 4, dtype=torch.float32), rand(3, 7, 4, seed=1, dtype=torch.float32)
+    assert is_stacked(sinkhorn(fx, fy))
+    large = rand(1, 260, 4, dtype=torch.float32)
+    assert is_stacked(sinkhorn(large[:, :252], large)) and not is_stacked(sinkhorn(large, large))
+
+
+def test_detached_plan_is_a_constant_without_a_stored_kernel(monkeypatch):
+    fx, fy, v = rand(2, 9, 4), rand(2, 6, 4, seed=1), rand(2, 6, 3, seed=2)
+    for small in (stacked.SMALL, 0):
+        monkeypatch.setattr(stacked, "SMALL", small)
+        for options in ({}, {"domain": "log"}, {"eps": torch.tensor(0.1).double().requires_grad_()}):
+            plan = sinkhorn(fx.clone().requires_grad_(), fy, **({"eps": 0.1} | options))
+            constant = plan.detach()
+            assert constant.shape == plan.shape and constant.n_iters == plan.n_iters
+            for name, reading in READINGS.items():
+                value = reading(constant, v, rand(2, 9, 2))
+                assert not value.requires_grad, name
+                assert_near(value, reading(plan, v, rand(2, 9, 2)).detach(), 1e-9)
+            assert torch.equal(constant.T.argmax(), plan.T.detach().argmax())
+            assert all(sample.kernel.tiles.stored is None for sample in constant._samples)
+    cost = rand(1, 5, 4).requires_grad_()
+    assert not sinkhorn_from_cost(cost).detach().dense().requires_grad
 
 
 def test_no_gradient_when_none_is_wanted(together):

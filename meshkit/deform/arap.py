@@ -8,7 +8,7 @@ from torch import Tensor
 
 from meshkit._compile import uncompiled
 from meshkit.deform.batched_deform import BatchedProblem
-from meshkit.deform.options import ARAPInfo, Options, check_options
+from meshkit.deform.options import ARAPInfo, Options, check_options, refuse_partial_gradient
 from meshkit.deform.problem import Problem
 from meshkit.deform.single import deform_each
 from meshkit.deform.topology import check_energy
@@ -16,9 +16,16 @@ from meshkit.deform.topology import check_energy
 __all__ = ["PRESETS", "arap_deform"]
 
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {"xdualnet": MappingProxyType({"energy": "spokes", "method": "local_global", "max_iter": 50, "tol": 0.0})}
+    {
+        "xdualnet": MappingProxyType(
+            {"energy": "spokes", "method": "local_global", "max_iter": 50, "tol": 0.0, "grad": "unroll"}
+        )
+    }
 )
-"""Options by name: ``arap_deform(..., **PRESETS["xdualnet"])`` is the deformer of the paper, and Open3D's."""
+"""Options by name: ``arap_deform(..., **PRESETS["xdualnet"])`` is the deformer of the paper, and Open3D's.
+
+Its 50 iterations end before the minimum, so what they are differentiated through is themselves.
+"""
 
 
 @uncompiled
@@ -71,9 +78,10 @@ def arap_deform(
         max_iter: evaluations, or iterations, at most.
         tol: stop at this residual (see :class:`ARAPInfo`). The rotations of "lbfgs" are float32 unless `verts` are
             float64 and `tol` is below 1e-7, or the batch is solved at once. 0 asks "local_global" for all iterations.
-        grad: "implicit" differentiates the minimum, which is exact only at one: look at ``info.converged`` and converge
-            further, or take "unroll", which records the iterations of "local_global" and differentiates them with
-            respect to `handle_pos` and `soft_targets` (only); "none" records nothing.
+        grad: "implicit" differentiates the minimum, exact only at one: a warning tells where `tol` was not met;
+            converge further, or take "unroll", which records the iterations of "local_global" and differentiates them
+            with respect to `handle_pos` and `soft_targets`, and refuses `verts` and `soft_weights` that want a
+            gradient; "none" records nothing.
         grad_tol: relative accuracy of the implicit gradient's linear solve, in the norm of the Hessian. On a body of
             6890 vertices the defaults give gradients within 2e-3 at 10 % handles and 6e-3 at 1 %, where `tol` 1e-9
             gives 2e-3; holding the rotations fixed would be wrong by 35 % and 83 %.
@@ -93,7 +101,8 @@ def arap_deform(
     Raises:
         ValueError: an unknown option; bad shapes, indices or mask; NaN or infinity; a mesh without a handle; a handle
             out of range or repeated; a component, or a vertex of no face, that nothing holds (it says so if the mesh
-            only needs welding); a degenerate face; soft weights without targets, or below 0.
+            only needs welding); a degenerate face; soft weights without targets, or below 0; "unroll" with `verts` or
+            `soft_weights` that want a gradient.
         ImportError: the package of the solver is missing.
 
     Reference:
@@ -121,6 +130,8 @@ def arap_deform(
         missing = "soft_targets" if soft_targets is None else "soft_weights"
         raise ValueError(f"soft_targets and soft_weights belong together; {missing} is missing")
     check_energy(energy)
+    if grad == "unroll":
+        refuse_partial_gradient(verts=verts, soft_weights=soft_weights)
     options = Options(method, max_iter, tol, grad, grad_tol, solver, compiled)
     if options.batched(verts.device) and BatchedProblem.possible(verts, faces, mask):
         whole = BatchedProblem(verts, faces, mask, energy, degenerate)

@@ -183,6 +183,6 @@ class BatchedProblem:
         moved = outcome.x
         if options.grad == "implicit" and torch.is_grad_enabled():
             negative = outcome.negative_curvature = outcome.negative_curvature.clone()
-            args = objective, options.grad_tol, negative
+            args = objective, options.grad_tol, negative, outcome.residual, options.tol
             moved = BatchedImplicit.apply(self.verts.double(), goal, soft_targets, soft_weights, moved.detach(), *args)
         return moved, outcome

@@ -7,14 +7,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from meshkit.deform.batched_objective import BatchedObjective
+from meshkit.deform.batched_objective import LOOK, BatchedObjective
 from meshkit.deform.batched_rotation import Differential
 from meshkit.deform.implicit import SADDLE
+from meshkit.deform.options import warn_unconverged
 from meshkit.topology import cotangent_weights
 
 __all__ = ["BatchedImplicit"]
-
-_LOOK = 8  # iterations between two looks at what is done
 
 
 class BatchedImplicit(torch.autograd.Function):
@@ -31,10 +30,13 @@ class BatchedImplicit(torch.autograd.Function):
         objective: BatchedObjective,
         tol: float,
         negative_curvature: Tensor,
+        residual: Tensor,
+        forward_tol: float,
     ) -> Tensor:
         """Return the minima. All positions are about the origins of their meshes."""
         ctx.save_for_backward(x, soft_targets)
         ctx.objective, ctx.tol, ctx.negative_curvature = objective, tol, negative_curvature
+        ctx.ended = residual, forward_tol
         return x.clone()
 
     @staticmethod
@@ -58,9 +60,11 @@ class BatchedImplicit(torch.autograd.Function):
         ctx.negative_curvature |= negative.view_as(ctx.negative_curvature)
         if bool(negative.any()):
             warnings.warn(SADDLE, stacklevel=2)
+        residual, forward_tol = ctx.ended
+        warn_unconverged(float(residual.amax()), forward_tol)
         change = turned(adjoint)
         wanted = ctx.needs_input_grad
-        grads: list[Tensor | None] = [None] * 8
+        grads: list[Tensor | None] = [None] * 10
         if wanted[0]:
             grads[0] = -_stationarity_gradient(objective, x, adjoint, R, change)
         if wanted[1]:
@@ -82,7 +86,7 @@ def _solve(objective: BatchedObjective, product: Any, grad: Tensor, tol: float) 
     negative = torch.zeros_like(square, dtype=torch.bool)
     for iteration in range(500):
         done = (square <= tol * tol * first) | negative
-        if iteration % _LOOK == 0 and bool(done.all()):
+        if iteration % LOOK == 0 and bool(done.all()):
             break
         image = torch.where(objective.free, product(direction), 0.0)
         curvature = per_mesh(direction * image)

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from meshkit.deform.batched import linear
 from meshkit.deform.batched_factor import BatchedFactor
+from meshkit.deform.objective import HALVINGS, LONGEST, MEMORY, SUFFICIENT
 
 __all__ = ["BatchedObjective", "BatchedOutcome", "alternate_batch", "minimise_batch"]
 
-_MEMORY, _HALVINGS, _SUFFICIENT, _LONGEST = 5, 8, 2e-4, 4.0
-_LOOK = 8  # evaluations between two looks at what is done
+LOOK = 8  # evaluations or iterations between two looks at what is done
 
 
 @dataclass
@@ -123,8 +123,8 @@ def minimise_batch(objective: BatchedObjective, x: Tensor, *, max_iter: int, tol
     energy, gradient = objective(x)
     evaluations = torch.ones_like(energy, dtype=torch.int64)
     slack = 1e-13 * objective.constant.abs()
-    moves, changes = (x.new_zeros(_MEMORY, *x.shape) for _ in range(2))
-    inverses = energy.new_zeros(_MEMORY, len(energy))  # 0 marks an empty place
+    moves, changes = (x.new_zeros(MEMORY, *x.shape) for _ in range(2))
+    inverses = energy.new_zeros(MEMORY, len(energy))  # 0 marks an empty place
     image, stretch = objective.image, torch.ones_like(energy)
     step, halvings = torch.ones_like(energy), torch.zeros_like(evaluations)
     stuck = negative = torch.zeros_like(energy, dtype=torch.bool)
@@ -133,12 +133,12 @@ def minimise_batch(objective: BatchedObjective, x: Tensor, *, max_iter: int, tol
         decrease = per_mesh(gradient * direction)
         residual = objective.relative(decrease, energy)
         done = (residual <= tol) | stuck
-        if evaluation == max_iter or (evaluation % _LOOK == 0 and bool(done.all())):
+        if evaluation == max_iter or (evaluation % LOOK == 0 and bool(done.all())):
             break
         move = spread(-step) * direction
         new_energy, new_gradient = objective(x + move)
         evaluations += ~done
-        accepted = ~done & (new_energy <= energy - _SUFFICIENT * step * decrease + slack)
+        accepted = ~done & (new_energy <= energy - SUFFICIENT * step * decrease + slack)
         change = new_gradient - gradient
         curvature = per_mesh(move * change)
         negative = torch.where(accepted, curvature < 0, negative)
@@ -150,7 +150,7 @@ def minimise_batch(objective: BatchedObjective, x: Tensor, *, max_iter: int, tol
         shifted = torch.cat([torch.where(bent, inverses[1:], 0.0), newest[None]])
         inverses = torch.where(accepted, shifted, inverses)
         # As in `minimise`; 1 after negative curvature, where `newest` is 0.
-        longer = (per_mesh(move * (objective.image - image)) * newest).clamp(1.0, _LONGEST)
+        longer = (per_mesh(move * (objective.image - image)) * newest).clamp(1.0, LONGEST)
         stretch = torch.where(accepted, longer, stretch)
         image = torch.where(taken, objective.image, image)
         x = torch.where(taken, x + move, x)
@@ -158,7 +158,7 @@ def minimise_batch(objective: BatchedObjective, x: Tensor, *, max_iter: int, tol
         energy = torch.where(accepted, new_energy, energy)
         # A refused step is halved; after several, the history is at fault, or rounding.
         halvings = torch.where(accepted, 0, halvings + 1)
-        failed = ~done & (halvings >= _HALVINGS)
+        failed = ~done & (halvings >= HALVINGS)
         stuck = stuck | (failed & (inverses == 0).all(0))
         inverses, stretch = torch.where(failed, 0.0, inverses), torch.where(failed, 1.0, stretch)
         step = torch.where(accepted | failed, 1.0, 0.5 * step)

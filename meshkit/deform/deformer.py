@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from meshkit._compile import uncompiled
 from meshkit._repr import settings
 from meshkit.deform.batched_deform import BatchedProblem
-from meshkit.deform.options import ARAPInfo, Options, check_options
+from meshkit.deform.options import ARAPInfo, Options, check_options, refuse_partial_gradient
 from meshkit.deform.problem import Problem
 from meshkit.deform.single import deform_each
 from meshkit.deform.topology import check_energy
@@ -110,6 +110,8 @@ class ARAPDeformer(nn.Module):
         Raises:
             ValueError: see :func:`meshkit.deform.arap_deform`.
         """
+        if self.options.grad == "unroll":
+            refuse_partial_gradient(rest=rest)
         deformed, self.info = self._deform(rest, target, faces, mask, handles, generator)
         return deformed
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from meshkit.deform.objective import Objective, dot
+from meshkit.deform.options import warn_unconverged
 from meshkit.deform.rest import stationarity_gradient
 from meshkit.deform.rotation import ClosestRotation, RotationDifferential
 
@@ -39,10 +40,13 @@ class ImplicitMinimum(torch.autograd.Function):
         objective: Objective,
         tol: float,
         negative_curvature: Tensor,
+        residual: float,
+        forward_tol: float,
     ) -> Tensor:
         """Return the minimum."""
         ctx.save_for_backward(minimum, soft_targets)
         ctx.objective, ctx.tol, ctx.negative_curvature = objective, tol, negative_curvature
+        ctx.ended = residual, forward_tol
         return minimum.clone()
 
     @staticmethod
@@ -58,9 +62,10 @@ class ImplicitMinimum(torch.autograd.Function):
         if negative:
             ctx.negative_curvature.fill_(True)
             warnings.warn(SADDLE, stacklevel=2)
+        warn_unconverged(*ctx.ended)
         change = hessian.rotation_change(adjoint)
         wanted = ctx.needs_input_grad
-        grads: list[Tensor | None] = [None] * 8
+        grads: list[Tensor | None] = [None] * 10
         if wanted[0]:
             grads[0] = -stationarity_gradient(rest, x, adjoint, hessian.R, change)
         if wanted[1]:

@@ -12,8 +12,9 @@ from meshkit.deform.tracker import RotationTracker
 
 __all__ = ["Objective", "Outcome", "minimise"]
 
-_MEMORY, _HALVINGS, _SUFFICIENT = 5, 8, 2e-4
-_LONGEST = 4.0  # times the step of local-global
+# Of L-BFGS, for one mesh as for a batch.
+MEMORY, HALVINGS, SUFFICIENT = 5, 8, 2e-4
+LONGEST = 4.0  # times the step of local-global
 
 
 @dataclass
@@ -139,10 +140,10 @@ def minimise(objective: Objective, x: Tensor, *, max_iter: int, tol: float, refi
         if residual <= tol or objective.evaluations >= max_iter:
             break
         step, accepted, along = 1.0, False, objective.spread(direction)
-        for _ in range(_HALVINGS):
+        for _ in range(HALVINGS):
             candidate = torch.sub(x, along, alpha=step)
             new_energy, new_gradient = objective(candidate)
-            accepted = new_energy <= energy - _SUFFICIENT * step * decrease + slack
+            accepted = new_energy <= energy - SUFFICIENT * step * decrease + slack
             if accepted or objective.evaluations >= max_iter:
                 break
             step *= 0.5
@@ -160,8 +161,8 @@ def minimise(objective: Objective, x: Tensor, *, max_iter: int, tol: float, refi
         curvature = dot(move, change)
         negative = curvature < 0
         if curvature > 0:
-            history = [*history[1 - _MEMORY :], (move, change, 1 / curvature)]
-            stretch = min(max(dot(move, objective.image - image) / curvature, 1.0), _LONGEST)
+            history = [*history[1 - MEMORY :], (move, change, 1 / curvature)]
+            stretch = min(max(dot(move, objective.image - image) / curvature, 1.0), LONGEST)
         else:
             history.clear()
             stretch = 1.0

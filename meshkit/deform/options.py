@@ -1,5 +1,7 @@
 """The choices of a deformation, and what it reports."""
 
+import math
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -7,7 +9,9 @@ from torch import Tensor
 
 from meshkit.deform.factor import SOLVERS, check_choice
 
-__all__ = ["ARAPInfo", "Options", "check_options"]
+__all__ = ["ARAPInfo", "Options", "check_options", "refuse_partial_gradient", "warn_unconverged"]
+
+DEFAULT_TOL = 1e-7
 
 
 @dataclass(frozen=True)
@@ -67,3 +71,26 @@ def check_options(
         raise ValueError(f"tol must be at least 0, got {tol}")
     if not 0 < grad_tol < 1:
         raise ValueError(f"grad_tol must be in (0, 1), got {grad_tol}")
+
+
+def refuse_partial_gradient(**tensors: Tensor | None) -> None:
+    """Raise ValueError if unrolling would leave out a gradient that is wanted."""
+    for name, value in tensors.items():
+        if value is not None and value.requires_grad and torch.is_grad_enabled():
+            raise ValueError(f'grad="unroll" has no gradient for {name}: detach() them or take grad="implicit"')
+
+
+def warn_unconverged(residual: float, tol: float) -> None:
+    """Say that an implicit gradient is taken where there is no minimum, unless it is as near as the default asks.
+
+    The residual is given by its power of ten, so that Python shows one warning and not one per step.
+    """
+    if not residual > max(tol, DEFAULT_TOL):
+        return
+    power = math.floor(math.log10(residual)) if residual < math.inf else 308
+    warnings.warn(
+        f'grad="implicit" is exact at a minimum only, and the deformation ended at a residual above 1e{power:+03d}: '
+        'raise max_iter, lower tol, take method="lbfgs", or differentiate the iterations of "local_global" with '
+        'grad="unroll"',
+        stacklevel=2,
+    )

@@ -69,9 +69,8 @@ def _deform_one(
     negative = torch.tensor(outcome.negative_curvature, device="cpu")
     converged = torch.tensor(outcome.converged, device="cpu")
     if options.grad == "implicit" and torch.is_grad_enabled():
-        moved = ImplicitMinimum.apply(
-            verts, targets, soft_targets, soft_weights, moved.detach(), objective, options.grad_tol, negative
-        )
+        args = objective, options.grad_tol, negative, outcome.residual, options.tol
+        moved = ImplicitMinimum.apply(verts, targets, soft_targets, soft_weights, moved.detach(), *args)
     evaluations = torch.tensor(outcome.evaluations, device="cpu")
     return moved, (energy, evaluations, residual, converged, negative)
 

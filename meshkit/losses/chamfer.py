@@ -5,11 +5,10 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from meshkit._numerics import safe_sqrt
 from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
-from meshkit.neighbors import gather_vertices, knn
+from meshkit.neighbors import distance_to_nearest
 
 __all__ = ["ChamferLoss", "chamfer_loss"]
 
@@ -34,9 +33,9 @@ def chamfer_loss(
           + \frac{1}{|Q|} \sum_{q \in Q} \min_{p \in P} \lVert q - p \rVert_2^2
 
     The two directions are summed, not halved. The nearest points are found without a gradient
-    (:func:`meshkit.neighbors.knn`: a KD-tree on the CPU, tiles elsewhere) and without an N x M matrix. Then the
-    distances are taken again from their indices. That is the exact gradient wherever the nearest point is unique, and
-    what is kept for it is O(N + M).
+    (:func:`meshkit.neighbors.knn`: a KD-tree on the CPU, tiles elsewhere and for small meshes) and without a large
+    N x M matrix. Then the distances are taken again from their indices. That is the exact gradient wherever the
+    nearest point is unique, and what is kept for it is O(N + M).
 
     Args:
         pred: P, ``(B, N, 3)``.
@@ -87,14 +86,9 @@ def chamfer_loss(
 def _one_way(
     start: Tensor, start_mask: Tensor | None, to: Tensor, to_mask: Tensor | None, squared: bool, reduction: Reduction
 ) -> Tensor:
-    nearest = gather_vertices(to, knn(to, 1, query=start, mask=to_mask)[..., 0])
-    difference = start - nearest
-    count: Tensor | int = start.shape[1]
-    if start_mask is not None:
-        difference = torch.where(start_mask[..., None], difference, 0)
-        count = start_mask.sum(1)
-    distance = difference.square().sum(2)
-    return reduce_samples((distance if squared else safe_sqrt(distance)).sum(1), count, reduction)
+    distance = distance_to_nearest(start, to, start_mask, to_mask, squared=squared)
+    count: Tensor | int = start.shape[1] if start_mask is None else start_mask.sum(1)
+    return reduce_samples(distance.sum(1), count, reduction)
 
 
 def _check_direction(direction: str) -> None:

@@ -2,10 +2,10 @@
 
 from torch import Tensor, nn
 
+from meshkit._connectivity import connectivity, edge_lengths
 from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
-from meshkit.losses._connectivity import connectivity, edge_lengths
 
 __all__ = ["EdgeLengthLoss", "edge_length_loss"]
 

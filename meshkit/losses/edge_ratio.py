@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor, nn
 
+from meshkit._connectivity import check_batch_faces, connectivity, edge_lengths
 from meshkit._numerics import launch_bound, safe_sqrt
 from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, check_reduction, check_same_shape, reduce_samples
-from meshkit.losses._connectivity import check_batch_faces, connectivity, edge_lengths
 from meshkit.neighbors import gather_vertices
 
 __all__ = ["EdgeRatioLoss", "edge_ratio_loss"]

@@ -5,10 +5,10 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from meshkit._connectivity import Connectivity, connectivity
 from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, check_same_shape, reduce_samples
-from meshkit.losses._connectivity import Connectivity, connectivity
 from meshkit.topology import cotangent_weights
 
 __all__ = ["LaplacianLoss", "laplacian_loss"]

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor, nn
 
+from meshkit._connectivity import connectivity
 from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
-from meshkit.losses._connectivity import connectivity
 
 __all__ = ["NormalConsistencyLoss", "normal_consistency_loss"]
 

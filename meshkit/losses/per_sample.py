@@ -29,7 +29,8 @@ class SinkhornDivergenceLoss(nn.Module):
     Args:
         eps: regularisation in squared units of length.
         n_iters: largest number of iterations.
-        tol: stop when the column sums are this close to their weights; ``None`` runs all iterations.
+        tol: stop when the column sums are this close to their weights; ``None`` runs all iterations. A warning tells
+            if ``n_iters`` ends before: the gradient's error is of first order in what is missing.
         anneal: factor of the falling regularisation; it starts at the largest cost of the batch, so that short of
             convergence a value depends slightly on the other samples. ``None`` starts at ``eps``, sample by sample.
         debias: subtract the self-transport terms.
@@ -49,7 +50,7 @@ class SinkhornDivergenceLoss(nn.Module):
         self,
         *,
         eps: float = 0.01,
-        n_iters: int = 100,
+        n_iters: int = 500,
         tol: float | None = 1e-4,
         anneal: float | None = 0.5,
         debias: bool = True,

@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from meshkit.batching import check_mask, check_verts
-from meshkit.topology import check_faces
 
 
 def check_clouds(pred: Tensor, target: Tensor, pred_mask: Tensor | None, target_mask: Tensor | None) -> None:
@@ -24,16 +23,6 @@ def check_pair(pred: Tensor, target: Tensor, mask: Tensor | None) -> None:
     if pred.shape != target.shape:
         raise ValueError(f"pred and target must have the same shape, got {tuple(pred.shape)} and {tuple(target.shape)}")
     check_mask(mask, pred.shape[0], pred.shape[1], nonempty=True)
-
-
-def check_faces_of(verts: Tensor, faces: Tensor) -> None:
-    """Faces shared by the batch, or one padded list per sample."""
-    check_faces(faces, verts.shape[1], batched=True)
-    if faces.ndim == 3 and len(faces) != len(verts):
-        raise ValueError(
-            f"faces {tuple(faces.shape)} must have the batch size of the vertices {tuple(verts.shape)}; pass (F, 3) to "
-            "share one face list"
-        )
 
 
 def common_dtype(first: Tensor, second: Tensor) -> torch.dtype:

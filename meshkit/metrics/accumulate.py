@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -44,6 +45,9 @@ class MeanMetric:
         process_group: of ``torch.distributed``, the default one if None. Used only if it is initialised.
         options: keyword arguments for every call of ``function``, e.g. ``squared=False``.
 
+    Raises:
+        TypeError: ``function`` has no such option.
+
     Example:
         >>> metric = MeanMetric(lambda pred, target: (pred - target).abs().mean(1))
         >>> metric.update(torch.ones(3, 5), torch.zeros(3, 5))
@@ -55,10 +59,18 @@ class MeanMetric:
     def __init__(
         self, function: Callable[..., Tensor], *, process_group: dist.ProcessGroup | None = None, **options: Any
     ) -> None:
+        _check_options(function, options)
         self.function = function
         self.options = options
         self.process_group = process_group
         self.reset()
+
+    def __repr__(self) -> str:
+        """Metric, options and number of samples so far."""
+        name = type(self).__name__
+        given = [] if name != "MeanMetric" else [getattr(self.function, "__name__", repr(self.function))]
+        given += [f"{key}={_short(value)}" for key, value in self.options.items()]
+        return f"{name}({', '.join(given)}): {self._count} samples"
 
     def reset(self) -> None:
         """Forget all samples."""
@@ -109,6 +121,23 @@ class MeanMetric:
             return None, state[-1]
         reduced = state[:-1] if size else state[0]
         return reduced if total is None else reduced.to(total), state[-1]
+
+
+def _check_options(function: Callable[..., Tensor], options: dict[str, Any]) -> None:
+    """Refuse options that the function does not have here, where they are given, and not at the first batch."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # of a function that tells nothing of itself
+        return
+    try:
+        signature.bind_partial(**options)
+    except TypeError as error:
+        name = getattr(function, "__name__", "the metric")
+        raise TypeError(f"{error}: options of {name} are {', '.join(signature.parameters)}") from None
+
+
+def _short(value: Any) -> str:
+    return f"tensor{tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
 
 
 class PMD(MeanMetric):

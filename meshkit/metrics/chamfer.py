@@ -2,12 +2,10 @@
 
 from typing import Literal, NamedTuple, get_args, overload
 
-import torch
 from torch import Tensor
 
-from meshkit._numerics import safe_sqrt
 from meshkit.metrics._common import check_clouds, common_dtype
-from meshkit.neighbors import gather_vertices, knn
+from meshkit.neighbors import distance_to_nearest
 
 __all__ = ["ChamferDetails", "chamfer_distance"]
 
@@ -116,23 +114,12 @@ def chamfer_distance(
     pred, target = pred.to(dtype), target.to(dtype)
     total, forward, backward = pred.new_zeros(len(pred)), None, None
     if direction != "backward":
-        forward = _to_nearest(pred, target, pred_mask, target_mask, squared)
+        forward = distance_to_nearest(pred, target, pred_mask, target_mask, squared=squared)
         total = total + _reduce(forward, pred_mask, point_reduction)
     if direction != "forward":
-        backward = _to_nearest(target, pred, target_mask, pred_mask, squared)
+        backward = distance_to_nearest(target, pred, target_mask, pred_mask, squared=squared)
         total = total + _reduce(backward, target_mask, point_reduction)
     return ChamferDetails(total, forward, backward) if return_distances else total
-
-
-def _to_nearest(
-    points: Tensor, others: Tensor, mask: Tensor | None, others_mask: Tensor | None, squared: bool
-) -> Tensor:
-    """(B, N): distance of each point to the nearest of the others, 0 where masked."""
-    difference = points - gather_vertices(others, knn(others, 1, query=points, mask=others_mask)[..., 0])
-    if mask is not None:
-        difference = torch.where(mask[..., None], difference, 0)
-    distance = difference.square().sum(2)
-    return distance if squared else safe_sqrt(distance)
 
 
 def _reduce(distance: Tensor, mask: Tensor | None, point_reduction: str) -> Tensor:

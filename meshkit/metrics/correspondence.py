@@ -5,8 +5,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from meshkit._connectivity import check_batch_faces
 from meshkit.batching import check_mask, check_verts, masked_mean
-from meshkit.metrics._common import check_faces_of
 from meshkit.neighbors import gather_vertices
 from meshkit.topology import mass_matrix
 
@@ -82,7 +82,7 @@ def correspondence_error(
     verts = target_verts.to(torch.promote_types(target_verts.dtype, torch.float32))
     matches, truth = (_checked_indices(i, num, mask, name) for i, name in ((matches, "matches"), (truth, "truth")))
     if faces is not None:
-        check_faces_of(verts, faces)
+        check_batch_faces(verts, faces)
     elif distance != "euclidean" or normalize:
         raise ValueError("geodesic distances and normalize=True need the faces of the target: pass faces=")
     if distance == "euclidean":

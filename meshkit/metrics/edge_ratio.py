@@ -1,11 +1,9 @@
 """Edge ratio: how much a prediction stretches the edges of its reference."""
 
-import torch
 from torch import Tensor
 
-from meshkit._numerics import safe_sqrt
-from meshkit.metrics._common import check_faces_of, check_pair, common_dtype
-from meshkit.topology import unique_edges
+from meshkit._connectivity import connectivity, edge_lengths
+from meshkit.metrics._common import check_pair, common_dtype
 
 __all__ = ["edge_ratio"]
 
@@ -41,23 +39,13 @@ def edge_ratio(
         tensor([0.5000])
     """
     check_pair(pred, target, mask)
-    check_faces_of(pred, faces)
     if not min_length >= 0:
         raise ValueError(f"min_length must be a length >= 0, got {min_length}")
     dtype = common_dtype(pred, target)
-    pred, target = pred.to(dtype), target.to(dtype)
-    shared = unique_edges(faces) if faces.ndim == 2 else None
-    values = []
-    for b in range(len(pred)):
-        edges = unique_edges(faces[b]) if shared is None else shared
-        if mask is not None:
-            edges = edges[mask[b][edges].all(1)]
-        reference = _edge_lengths(target[b], edges)
-        regular = reference > min_length
-        ratio = _edge_lengths(pred[b], edges[regular]) / reference[regular]
-        values.append((ratio - 1).abs().mean())
-    return torch.stack(values)
-
-
-def _edge_lengths(verts: Tensor, edges: Tensor) -> Tensor:
-    return safe_sqrt((verts[edges[:, 0]] - verts[edges[:, 1]]).square().sum(1))
+    mesh = connectivity(pred, faces)
+    real = None if mask is None else mesh.real(mask, mesh.edges)
+    length, reference = (edge_lengths(mesh, positions.to(dtype), real) for positions in (pred, target))
+    regular = reference > min_length
+    terms = (length / reference.where(regular, 1) - 1).abs().where(regular, 0)
+    total = mesh.totals(terms, mesh.edge_counts)
+    return total / mesh.counts(regular, mesh.edge_counts, total)

@@ -3,8 +3,9 @@
 import torch
 from torch import Tensor
 
+from meshkit._connectivity import check_batch_faces
 from meshkit.batching import check_mask, check_verts
-from meshkit.metrics._common import check_faces_of, real_faces
+from meshkit.metrics._common import real_faces
 
 __all__ = ["self_intersection_rate"]
 
@@ -41,7 +42,7 @@ def self_intersection_rate(verts: Tensor, faces: Tensor, *, mask: Tensor | None 
 
     check_verts(verts)
     check_mask(mask, verts.shape[0], verts.shape[1], nonempty=True)
-    check_faces_of(verts, faces)
+    check_batch_faces(verts, faces)
     real = real_faces(faces, mask).expand(len(verts), -1)
     rates = []
     for b in range(len(verts)):

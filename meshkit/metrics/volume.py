@@ -3,8 +3,9 @@
 import torch
 from torch import Tensor
 
+from meshkit._connectivity import check_batch_faces
 from meshkit.batching import bounding_box_center
-from meshkit.metrics._common import check_faces_of, check_pair, common_dtype, real_faces
+from meshkit.metrics._common import check_pair, common_dtype, real_faces
 
 __all__ = ["volume_change"]
 
@@ -37,7 +38,7 @@ def volume_change(pred: Tensor, target: Tensor, faces: Tensor, *, mask: Tensor |
         tensor([7.])
     """
     check_pair(pred, target, mask)
-    check_faces_of(pred, faces)
+    check_batch_faces(pred, faces)
     dtype = common_dtype(pred, target)
     before, after = (_volume(verts.to(dtype), faces, mask) for verts in (target, pred))
     return (after - before) / before.abs()

@@ -12,14 +12,25 @@ from meshkit._numerics import launch_bound
 ROWS = 512  # of a tile on a CPU: a few tiles of 1024 float32 channels stay in the cache between passes
 
 
+def samples_per_tile(x: Tensor) -> int:
+    """How many whole samples a tile on a CPU spans; 0 if a sample fills at least one by itself."""
+    together = ROWS // max(1, x.shape[1])
+    return together if together > 1 and len(x) > 1 else 0
+
+
 def tiles(x: Tensor) -> Iterator[tuple[int | slice, slice]]:
     """Samples and rows of each tile of ``x (B, N, C)``.
 
-    On a CPU a tile is some rows of one sample, ``(R, C)``. Elsewhere each operation costs a launch and there is no
+    On a CPU a tile is some rows of one sample, ``(R, C)``, or, where these are few, some whole samples ``(S, N, C)``,
+    since starting an operation then costs more than running it. Elsewhere each operation costs a launch and there is no
     cache to stay in: the only tile is the batch, ``(B, N, C)``.
     """
     if launch_bound(x):
         yield slice(None), slice(None)
+        return
+    if together := samples_per_tile(x):
+        for start in range(0, len(x), together):
+            yield slice(start, min(start + together, len(x))), slice(None)
         return
     for sample in range(len(x)):
         for start in range(0, x.shape[1], ROWS):
@@ -28,7 +39,10 @@ def tiles(x: Tensor) -> Iterator[tuple[int | slice, slice]]:
 
 def tile_buffer(x: Tensor, dtype: torch.dtype) -> Tensor:
     """Room for one tile, to be used for all of them: fresh memory costs as much as a pass over it."""
-    shape = x.shape if launch_bound(x) else (min(ROWS, x.shape[1]), x.shape[2])
+    shape: tuple[int, ...] = x.shape
+    if not launch_bound(x):
+        together = samples_per_tile(x)
+        shape = (min(together, len(x)), *x.shape[1:]) if together else (min(ROWS, x.shape[1]), x.shape[2])
     return torch.empty(shape, dtype=dtype, device=x.device)
 
 

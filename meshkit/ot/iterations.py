@@ -262,7 +262,8 @@ def _implicit(
         forth = tiles.apply((root * z / c)[:, None], reference) * (a / r)[:, None]
         return project(z - damping * (b / root) * tiles.apply_transpose(forth, reference)[:, 0])
 
-    z = conjugate_gradient(operator, project(gradient / root))
+    rhs = gradient / root
+    z = conjugate_gradient(operator, project(rhs), rhs.norm())
     solution = root * z
     grad_nu = settings.power_y * solution
     grad_c = -grad_nu / c
@@ -271,23 +272,30 @@ def _implicit(
     return factors, grad_mu / mu, grad_nu / nu
 
 
-def conjugate_gradient(operator: Any, rhs: Tensor, max_iter: int = 500) -> Tensor:
-    """Solve with a symmetric positive semi-definite operator to the precision of the dtype."""
+def conjugate_gradient(operator: Any, rhs: Tensor, size: Tensor, max_iter: int = 500) -> Tensor:
+    """Solve with a symmetric positive semi-definite operator to the precision of the dtype, relative to ``size``.
+
+    That is the norm of the right-hand side before it was projected: what rounding left of the free direction is no
+    more than noise, and its solution 0.
+    """
     solution, residual, direction = torch.zeros_like(rhs), rhs.clone(), rhs.clone()
     squared = residual @ residual
-    target = (1e-6 if rhs.dtype == torch.float32 else 1e-13) ** 2 * squared
+    target = (1e-6 if rhs.dtype == torch.float32 else 1e-13) ** 2 * size.square()
     for _ in range(max_iter):
         if bool(squared <= target):
             return solution
         image = operator(direction)
-        step = squared / (direction @ image)
+        curvature = direction @ image
+        if bool(curvature <= 0):  # of a positive operator that is rounding, and another step would be noise
+            return solution
+        step = squared / curvature
         solution += step * direction
         residual -= step * image
         previous, squared = squared, residual @ residual
         direction = residual + squared / previous * direction
     warnings.warn(
         f"the implicit gradient of sinkhorn stopped after {max_iter} steps at relative residual "
-        f"{float((squared / rhs.square().sum()).sqrt()):.1e}; the iterations may not have converged either",
+        f"{float(squared.sqrt() / size):.1e}; the iterations may not have converged either",
         stacklevel=2,
     )
     return solution

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from meshkit._repr import settings
-from meshkit.ot.options import Cost, Domain, Eps, Grad, Reach, Store, check_choice, read_options
+from meshkit.ot.options import Cost, Domain, Eps, Grad, Reach, Store, check_choice, plain, read_options
 from meshkit.ot.plan import TransportPlan
 from meshkit.ot.sinkhorn import sinkhorn
 
@@ -63,6 +63,7 @@ class SinkhornCorrespondence(nn.Module):
     ) -> None:
         super().__init__()
         check_choice("cost", cost, Cost)
+        eps, n_iters, tol, reach = (plain(value) for value in (eps, n_iters, tol, reach))
         read_options(eps, n_iters, tol, reach, grad, domain, store)
         self.cost, self.n_iters, self.tol, self.reach = cost, n_iters, tol, reach
         self.grad, self.domain, self.store, self.min_eps = grad, domain, store, min_eps

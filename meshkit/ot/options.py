@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -26,12 +26,16 @@ KEEP_BYTES = 1 << 30
 
 
 class Options(NamedTuple):
-    """Options of :func:`sinkhorn`, read and checked."""
+    """Options of :func:`sinkhorn`, read and checked.
+
+    With ``dual`` the potentials are constants, ``"between"`` two sets or ``"within"`` one: see :mod:`meshkit.ot.dual`.
+    """
 
     eps: float | Tensor
     settings: Settings
     domain: Domain
     store: Store
+    dual: Literal["between", "within"] | None = None
 
     @property
     def unbalanced(self) -> bool:
@@ -55,12 +59,13 @@ def read_options(
     eps: Eps, n_iters: int, tol: float | None, reach: Reach, grad: str, domain: Domain, store: Store
 ) -> Options:
     """Check the options."""
+    eps, n_iters, tol, reach = (plain(value) for value in (eps, n_iters, tol, reach))
     for name, given, choices in (("grad", grad, Grad), ("domain", domain, Domain), ("store", store, Store)):
         check_choice(name, given, choices)
     if not isinstance(n_iters, int) or n_iters < 1:
-        raise ValueError(f"n_iters must be an integer of at least 1, got {n_iters}")
+        raise ValueError(f"n_iters must be an integer of at least 1, got {n_iters!r}")
     if tol is not None and not tol >= 0:
-        raise ValueError(f"tol must be None or at least 0, got {tol}")
+        raise ValueError(f"tol must be None or at least 0, got {tol!r}")
     scales: tuple[float, ...] = ()
     if isinstance(eps, str) or not isinstance(eps, int | float | Tensor | Sequence):
         raise ValueError(f"eps must be a number, a scalar tensor or a sequence of numbers, got {type(eps).__name__}")
@@ -83,12 +88,12 @@ def read_options(
     if not 0 < value < math.inf:
         raise ValueError(f"eps must be positive and finite, got {value:g}")
     powers = []
-    sides = tuple(reach) if isinstance(reach, Sequence) else (reach, reach)
+    sides = tuple(plain(side) for side in reach) if isinstance(reach, Sequence) else (reach, reach)
     if len(sides) != 2 or not all(side is None or isinstance(side, int | float) for side in sides):
         raise ValueError(f"reach must be None, a number, or a pair of these for rows and columns, got {reach!r}")
     for side in sides:
         if side is not None and not side > 0:
-            raise ValueError(f"reach must be positive, or None for an exact marginal, got {reach}")
+            raise ValueError(f"reach must be positive, or None for an exact marginal, got {reach!r}")
         powers.append(1.0 if side is None or side == math.inf else side / (side + value))
     if scales and powers != [1.0, 1.0]:
         raise ValueError("reach cannot be combined with a sequence of eps")
@@ -97,6 +102,11 @@ def read_options(
     if isinstance(eps, Tensor):
         eps = (eps.detach() if grad == "none" else eps).reshape(())
     return Options(eps, Settings(n_iters, tol, powers[0], powers[1], grad, scales), domain, store)
+
+
+def plain(value: Any) -> Any:
+    """A NumPy scalar or array as the numbers it holds; all else as it is."""
+    return value.tolist() if hasattr(value, "tolist") and not isinstance(value, Tensor) else value
 
 
 def check_choice(name: str, value: object, choices: object) -> None:

@@ -83,6 +83,22 @@ class TransportPlan:
             return [self._given.n_iters] * self._shape[0]
         return [sample.n_iters for sample in self._given]
 
+    def detach(self) -> TransportPlan:
+        """The same plan as a constant, without the graph and without a stored kernel: to keep for logging.
+
+        Readings compute the kernel again.
+
+        Example:
+            >>> from meshkit.ot import sinkhorn
+            >>> features = torch.eye(3, requires_grad=True)[None]
+            >>> plan = sinkhorn(features, features)
+            >>> plan.cost().requires_grad, plan.detach().cost().requires_grad
+            (True, False)
+        """
+        with torch.autocast(self.device.type, enabled=False):
+            samples = [sample.detach() for sample in self._samples]
+        return TransportPlan(samples, self._shape, transposed=self._transposed)
+
     def __matmul__(self, values: Tensor) -> Tensor:
         """``T @ values`` for ``values`` of shape ``(B, M, C)``: ``(B, N, C)``. Each row holds its mass times a mean."""
         values = self._checked(values)
@@ -134,7 +150,9 @@ class TransportPlan:
     def potentials(self) -> tuple[Tensor, Tensor]:
         r"""Dual potentials ``f (B, N)`` and ``g (B, M)`` in units of the cost.
 
-        :math:`T_{ij} = \exp((f_i + g_j - C_{ij}) / \varepsilon)`; -inf where there is no mass.
+        :math:`T_{ij} = \exp((f_i + g_j - C_{ij}) / \varepsilon)`; -inf where there is no mass. In balanced transport a
+        constant may move from f to g: it is that of the iterations, but with ``grad="implicit"``, whose gradient is of
+        the limit, the one that makes :math:`\sum_j \nu_j g_j = 0`.
         """
         rows, columns = zip(*(sample.potentials() for sample in self._samples), strict=True)
         f = self._spread(rows, over_rows=True, empty=-torch.inf)

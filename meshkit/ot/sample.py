@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -31,6 +31,8 @@ class SamplePlan:
         index_x: positions of the rows in the padded batch, or ``None`` for all.
         index_y: of the columns.
         n_iters: iterations done.
+        centred: potentials are given with those of the columns of mean 0. The gradient of a limit knows no free
+            constant, which an upstream gradient must not ask for.
     """
 
     kernel: GibbsKernel
@@ -44,7 +46,21 @@ class SamplePlan:
     index_x: Tensor | None
     index_y: Tensor | None
     n_iters: int
+    centred: bool = False
     _sums: Tensor | None = field(default=None, repr=False)
+
+    def detach(self) -> SamplePlan:
+        """The same numbers without their graph and without a stored kernel."""
+        tiles = self.kernel.tiles.transposed().transposed()  # which stores nothing
+        return replace(
+            self,
+            kernel=GibbsKernel(tiles, *(tensor.detach() for tensor in self.kernel.inputs)),
+            mu=self.mu.detach(),
+            nu=self.nu.detach(),
+            b=self.b.detach(),
+            eps=self.eps.detach() if isinstance(self.eps, Tensor) else self.eps,
+            _sums=None if self._sums is None else self._sums.detach(),
+        )
 
     def rows(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """``K (b v)`` and ``K b`` in one sweep."""
@@ -110,7 +126,11 @@ class SamplePlan:
     def potentials(self) -> tuple[Tensor, Tensor]:
         """Dual potentials in units of the cost."""
         log_a, log_b = self.logarithms()
-        return self.eps * log_a + self.shift, self.eps * log_b
+        f, g = self.eps * log_a + self.shift, self.eps * log_b
+        if not self.centred or len(g) == 0:
+            return f, g
+        constant = (self.nu * g).sum() / self.nu.sum()
+        return f + constant, g - constant
 
     def log_dense(self) -> Tensor:
         """Natural logarithm of the plan, ``(N, M)``."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from meshkit._compile import uncompiled
 from meshkit.ot.costs import logit_features
+from meshkit.ot.dual import iterate_between, iterate_within
 from meshkit.ot.iterations import iterate_kernel, iterate_log
 from meshkit.ot.kernel import GibbsKernel
 from meshkit.ot.marginals import Sides, marginals
@@ -78,9 +79,9 @@ def sinkhorn(
         domain: ``"kernel"`` iterates on :math:`K` (fast), ``"log"`` on its logarithm (safe at any ``eps``), ``"auto"``
             takes the kernel where the range of the dtype allows: for uniform weights and the cosine cost
             ``eps >= 2 / (log(max) - log(N M))``, .0282 for 6890 x 6890 in float32. A plan forced into the kernel domain
-            below that may be NaN. On a GPU, samples of one size (cosine cost, no masks, weights, ``tol`` or
-            ``check_finite``) are solved together in the kernel domain where that is allowed; else float32 features go
-            through Triton kernels, which always work in the log domain.
+            below that may be NaN. On a GPU, and on a CPU up to 65,536 entries each, samples of one size (cosine cost,
+            no masks, weights, ``tol`` or ``check_finite``) are solved together in the kernel domain where that is
+            allowed; else float32 features on a GPU go through Triton kernels, which always work in the log domain.
         store: ``"keep"`` holds K for all later sweeps and the backward pass, N x M numbers per sample; ``"stream"``
             computes it again, in :math:`O((N + M) D)` memory; ``"auto"`` keeps up to 1 GiB, on a GPU up to 128 MiB. A
             kept K lives as long as the plan or the graph of its readings. Triton kernels always stream; the
@@ -113,6 +114,23 @@ def sinkhorn(
     check_features(fx, fy)
     check_choice("cost", cost, Cost)
     options = read_options(eps, n_iters, tol, reach, grad, domain, store)
+    masks = {"mask_x": mask_x, "mask_y": mask_y}
+    return solve_features(fx, fy, cost, options, a=a, b=b, **masks, check_finite=check_finite)
+
+
+def solve_features(
+    fx: Tensor,
+    fy: Tensor,
+    cost: Cost,
+    options: Options,
+    *,
+    a: Tensor | None,
+    b: Tensor | None,
+    mask_x: Tensor | None,
+    mask_y: Tensor | None,
+    check_finite: bool = False,
+) -> TransportPlan:
+    """:func:`sinkhorn` with options read already."""
     shape = len(fx), fx.shape[1], fy.shape[1]
     dtype = torch.promote_types(torch.promote_types(fx.dtype, fy.dtype), torch.float32)
     with torch.autocast(fx.device.type, enabled=False):
@@ -125,10 +143,10 @@ def sinkhorn(
             x, y = sides.rows_of(fx[s].to(dtype)), sides.columns_of(fy[s].to(dtype))
             if check_finite and not bool(x.isfinite().all() & y.isfinite().all()):
                 raise ValueError(f"sample {s} has features that are not finite; mask those vertices or mend them")
-            if grad == "none":
+            if options.settings.grad == "none":
                 x, y, sides = x.detach(), y.detach(), sides.detached()
             x, y, spread, shift = logit_features(x, y, cost, options.eps, constant=options.unbalanced)
-            chosen = options.domain_for(spread, sides)
+            chosen = "log" if options.dual == "within" else options.domain_for(spread, sides)
             tiles = feature_tiles(x, y, "none" if not keep else "kernel" if chosen == "kernel" else "logits")
             chosen = "log" if tiles.log_only and len(x) else chosen
             samples.append(solve(GibbsKernel(tiles, x, y), sides, options, chosen, shift))
@@ -271,7 +289,11 @@ def solve(
     kernel: GibbsKernel, sides: Sides, options: Options, domain: str, shift: float, start: Tensor | None = None
 ) -> SamplePlan:
     """Iterate in the chosen domain."""
-    if domain == "kernel" or len(sides.mu) == 0:
+    if options.dual == "within" and len(sides.mu):
+        solution = iterate_within(kernel, sides.mu, options.settings)
+    elif options.dual == "between" and domain == "log" and len(sides.mu):
+        solution = iterate_between(kernel, sides.mu, sides.nu, options.settings)
+    elif domain == "kernel" or len(sides.mu) == 0:
         solution = iterate_kernel(kernel, sides.mu, sides.nu, options.settings)
     else:
         solution = iterate_log(kernel, sides.mu, sides.nu, options.settings, start)
@@ -287,6 +309,7 @@ def solve(
         index_x=sides.index_x,
         index_y=sides.index_y,
         n_iters=solution.n_iters,
+        centred=options.settings.grad == "implicit" and not options.unbalanced,
     )
 
 

@@ -1,8 +1,8 @@
 r"""Samples of one size solved together, their kernels stored: many small problems at the price of one.
 
 The iterations and their gradient are those of :mod:`meshkit.ot.iterations` in the kernel domain with uniform marginals,
-on tensors with a leading batch dimension. Where starting an operation costs more than running it, as on a GPU, a loop
-over samples would cost a batch of small problems many times their work.
+on tensors with a leading batch dimension. Where starting an operation costs more than running it, on a GPU always and
+on a CPU for small problems, a loop over samples would cost many times the work itself.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ from meshkit.ot.tiles import LOG2_E, Factors, FeatureTiles, Reference, Tiles
 
 __all__: list[str] = []  # internal: meshkit.ot lists what is public
 
+SMALL = 1 << 16
+"""On a CPU, entries of a kernel up to which samples are solved together; larger ones gain by staying in the cache."""
+
 STACK_BYTES = 1 << 27
 """Kernels up to this size, all samples together, are stored by ``store="auto"``."""
 
@@ -34,9 +37,17 @@ def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, *given: Tenso
     Only the cosine cost has a range that is known without a look at the features.
     """
     settings, store = options.settings, options.store
-    if not launch_bound(fx) or cost != "cosine" or any(tensor is not None for tensor in given):
+    if cost != "cosine" or any(tensor is not None for tensor in given):
         return False
-    if options.unbalanced or settings.tol is not None or settings.scales or settings.grad not in ("unroll", "none"):
+    if not launch_bound(fx) and fx.shape[1] * fy.shape[1] > SMALL:
+        return False
+    if (
+        options.dual
+        or options.unbalanced
+        or settings.tol is not None
+        or settings.scales
+        or settings.grad not in ("unroll", "none")
+    ):
         return False
     (batch, rows, _), columns, dtype = fx.shape, fy.shape[1], torch.promote_types(fx.dtype, torch.float32)
     if options.domain == "log" or store == "stream":

@@ -17,7 +17,7 @@ from meshkit.topology import check_faces
 
 @dataclass(frozen=True)
 class Connectivity:
-    """What the losses know of the faces of a batch, read as rows and lanes.
+    """What losses and metrics know of the faces of a batch, read as rows and lanes.
 
     Faces shared by the batch: row n is vertex n, and its L = B lanes are the samples, so that an index is looked up
     once for all of them. Faces of each mesh: the batch is one mesh of B N rows, row b N + n is vertex n of sample b,
@@ -178,8 +178,8 @@ def check_batch_faces(verts: Tensor, faces: Tensor) -> None:
     check_faces(faces, verts.shape[1], batched=True)
     if faces.ndim == 3 and len(faces) != len(verts):
         raise ValueError(
-            f"faces {tuple(faces.shape)} must have the batch size of verts {tuple(verts.shape)}; pass (F, 3) to share "
-            "one face list"
+            f"faces {tuple(faces.shape)} must have the batch size of the vertices {tuple(verts.shape)}; pass (F, 3) to "
+            "share one face list"
         )
 
 
