@@ -247,10 +247,12 @@ class PoseTransferGenerator(nn.Module):
         *pair: Any,
     ) -> Tensor:
         """Features of the identity mesh, of its mirror image where that is what a vertex is better matched as."""
-        whole = (verts, features, pair[2], descriptors)
+        mask: Tensor | None = pair[2]
         # An identity beside several poses comes as one mesh, expanded: its mirror image is one too.
-        once = all(x is None or x.stride(0) == 0 for x in whole)
-        one, own, mask, known = (x[:1] if once and x is not None else x for x in whole)
+        once = all(x is None or x.stride(0) == 0 for x in (verts, features, mask, descriptors))
+        first = slice(0, 1) if once else slice(None)
+        one, own = verts[first], features[first]
+        mask, known = (None if x is None else x[first] for x in (mask, descriptors))
         mirrored = self.encode(one * one.new_tensor([-1.0, 1.0, 1.0]), mask=mask, descriptors=known)
         with torch.no_grad():  # which sides correspond is a choice, without a derivative
             partners = self.match(mirrored, own, identity_mask=mask, pose_mask=mask).argmax()

@@ -109,7 +109,7 @@ def sinkhorn_divergence(
             schedule = eps_schedule(max(eps, start if start < math.inf else eps), eps, factor=anneal)[-n_iters:]
         regularisation = schedule if isinstance(schedule, list) and len(schedule) > 1 else eps
         options = read_options(regularisation, n_iters, tol, None, "unroll", domain, store)._replace(dual=dual)
-        weights = {"a": first.weights, "b": second.weights, "mask_x": first.mask, "mask_y": second.mask}
+        weights: dict[str, Any] = {"a": first.weights, "b": second.weights, "mask_x": first.mask, "mask_y": second.mask}
         plan = solve_features(first.points, second.points, cost, options, **weights)
         if tol is not None and max(plan.n_iters) == n_iters:
             with torch.no_grad():
