@@ -14,10 +14,21 @@ from update_public_api import API_FILE, public_modules, public_names
 PACKAGE = Path(__file__).parents[1] / "meshkit"
 
 # component -> components of meshkit that it may import, at any depth of its code.
-FOUNDATION = {"_checks", "_compile", "_numerics", "_repr", "batching", "scatter", "topology", "neighbors"}
+FOUNDATION = {
+    "_checks",
+    "_compile",
+    "_connectivity",
+    "_numerics",
+    "_repr",
+    "batching",
+    "scatter",
+    "topology",
+    "neighbors",
+}
 MAY_IMPORT: dict[str, set[str]] = {
     "_checks": set(),
     "_compile": set(),
+    "_connectivity": {"_compile", "_numerics", "topology"},
     "_numerics": set(),
     "_repr": set(),
     "batching": set(),

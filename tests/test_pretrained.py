@@ -219,12 +219,16 @@ def test_a_run_that_began_with_others_has_their_commands(exporter, finished_run,
     first = begun("first", init="xdualnet-humans", seed=1)
     second = begun("second", init=str(first), seed=2, sampled_poses=30)
     found = runs(second, "new")
-    assert [run["seed"] for run in found] == [shipped["seed"], 1, 2]
-    assert found[0]["command"] == f"{shipped['command']} --name new-1"
-    assert found[0]["machine"] == shipped["machine"]
-    for number, run in enumerate(found[1:], 1):
+    earlier = [*shipped["before"], shipped]  # these weights began with others themselves
+    assert [run["seed"] for run in found] == [*(run["seed"] for run in earlier), 1, 2]
+    for number, (run, known) in enumerate(zip(found, earlier, strict=False), 1):
+        settings, known_settings = (r["command"].partition(" --init")[0].partition(" --name")[0] for r in (run, known))
+        assert settings == known_settings
+        assert run["command"].endswith(f" --init runs/new-{number - 1}" * (number > 1) + f" --name new-{number}")
+        assert run["command"].count("--name") == 1 and run["machine"] == known["machine"]
+    for number, run in enumerate(found[-2:], len(earlier)):
         assert run["command"].endswith(f" --no-corr --init runs/new-{number} --name new-{number + 1}")
-    assert ("--sampled-poses 30" in found[1]["command"], "--sampled-poses 30" in found[2]["command"]) == (False, True)
+    assert ["--sampled-poses 30" in run["command"] for run in found[-2:]] == [False, True]
     assert "and 850 poses, 30 more put together" in exporter.trained_on(found, exporter.load_shipped("humans")[1])
     with pytest.raises(ValueError, match=r"trained on animals, but began with .*second, of humans"):
         runs(begun("third", init=str(second), data="animals"), "new")

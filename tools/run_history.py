@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 import sys
 import time
 from dataclasses import asdict
@@ -73,14 +74,18 @@ def _runs(folder: Path) -> list[dict[str, Any]]:
     }
     if init in pretrained_names():
         card = read_card(init)
-        if "before" in card:
-            raise ValueError(f"it began with --init {init}, weights of several runs: begin with the last of these runs")
         check_same_bodies(config, card, f"the weights {init}")
-        return [{fact: card[fact] for fact in FACTS if fact in card}, own]
+        return [*(_of_card(run) for run in (*card.get("before", ()), card)), own]
     if init is None:
         return [own]
     check_same_bodies(config, json.loads((Path(init) / "config.json").read_text()), init)
     return [*_runs(Path(init)), own]
+
+
+def _of_card(run: dict[str, Any]) -> dict[str, Any]:
+    """A card's facts of a run, without the names that the card gave to several."""
+    command = re.sub(r"( --init \S+)? --name \S+$", "", run["command"])
+    return {fact: run[fact] for fact in FACTS if fact in run} | {"command": command}
 
 
 def check_same_bodies(config: dict[str, Any], before: dict[str, Any], name: str) -> None:
