@@ -1,40 +1,18 @@
 """Doubts about a transfer, and how they are told."""
 
-import re
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 from meshkit.io.report import counted
 
-__all__ = ["Doubt", "following", "said_once"]
+if TYPE_CHECKING:
+    from meshkit.transfer.report import Doubt
+
+__all__ = ["following", "said_once"]
 
 _ROLES = ("identity", "pose")
-
-
-class Doubt(NamedTuple):
-    """Something unusual or in doubt.
-
-    Attributes:
-        role: ``"identity"`` or ``"pose"``, whichever mesh it is about; empty if it is about the two together.
-        text: what it is, and what to do; it holds no name of a file.
-        follows: whether it is only to be expected, as a mesh that it is about is not of the weights' kind, which is a
-            doubt of its own. The printed report counts such doubts.
-    """
-
-    role: str
-    text: str
-    follows: bool = False
-
-    @property
-    def tells_role(self) -> bool:
-        """Whether the text says itself which mesh it is about, if it is about one."""
-        return not self.role or f"the {self.role} mesh" in self.text
-
-    @property
-    def headline(self) -> str:
-        """What it is and of which mesh, without numbers and advice: the same for every pose that has it."""
-        clause = re.split(r" \(|[:;]", self.text, maxsplit=1)[0]
-        return clause if self.tells_role else f"{self.role}: {clause}"
 
 
 def said_once(doubts: Sequence[Doubt]) -> list[Doubt]:

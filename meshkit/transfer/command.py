@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from meshkit._transfer_command import check_out, main
+from meshkit import _transfer_command
 from meshkit.io import atomic_write, save_mesh
 from meshkit.io.report import counted
 from meshkit.transfer._doubts import following
@@ -29,6 +29,11 @@ __all__ = ["main"]
 _ROWS = 6  # of the picture of a sequence
 
 
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; a user's error is told on the error stream, with exit status 2."""
+    _transfer_command.main(arguments)
+
+
 def run(args: argparse.Namespace, written: list[Path]) -> None:
     """Transfer, write and report.
 
@@ -37,7 +42,7 @@ def run(args: argparse.Namespace, written: list[Path]) -> None:
         written: to which every result is added once it is complete.
     """
     many = is_sequence(args.pose)
-    check_out(args.out, many)
+    _transfer_command.check_out(args.out, many)
     meshes = read_sequence(args.pose) if many else [args.pose]
     files = _result_files(args.out, meshes) if many else {str(args.pose): args.out}
     _check_inputs_are_safe(args, meshes, files)

@@ -1,16 +1,43 @@
 """What a transfer returns: the mesh, what was done, and how far to trust it."""
 
+import re
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from meshkit.transfer._doubts import Doubt, following
+from meshkit.transfer._doubts import following
 from meshkit.transfer._frames import axis_name
 from meshkit.transfer._prepare import Prepared
 from meshkit.transfer.confidence import Confidence
 
 __all__ = ["Doubt", "TransferReport", "TransferResult"]
+
+
+class Doubt(NamedTuple):
+    """Something unusual or in doubt.
+
+    Attributes:
+        role: ``"identity"`` or ``"pose"``, whichever mesh it is about; empty if it is about the two together.
+        text: what it is, and what to do; it holds no name of a file.
+        follows: whether it is only to be expected, as a mesh that it is about is not of the weights' kind, which is a
+            doubt of its own. The printed report counts such doubts.
+    """
+
+    role: str
+    text: str
+    follows: bool = False
+
+    @property
+    def tells_role(self) -> bool:
+        """Whether the text says itself which mesh it is about, if it is about one."""
+        return not self.role or f"the {self.role} mesh" in self.text
+
+    @property
+    def headline(self) -> str:
+        """What it is and of which mesh, without numbers and advice: the same for every pose that has it."""
+        clause = re.split(r" \(|[:;]", self.text, maxsplit=1)[0]
+        return clause if self.tells_role else f"{self.role}: {clause}"
 
 
 @dataclass(frozen=True)

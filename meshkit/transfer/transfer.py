@@ -10,13 +10,13 @@ from torch import Tensor
 from meshkit.deform import arap_deform
 from meshkit.models import GeneratorOutput, PretrainedTransfer
 from meshkit.transfer._choose import Weights, choose_weights
-from meshkit.transfer._doubts import Doubt, said_once
+from meshkit.transfer._doubts import said_once
 from meshkit.transfer._frames import axis_name, turn_up
 from meshkit.transfer._open import Mesh, OpenedMesh, named, open_mesh
 from meshkit.transfer._orient import RestBody
 from meshkit.transfer._prepare import Prepared, prepare
 from meshkit.transfer.confidence import Confidence, measure_confidence
-from meshkit.transfer.report import TransferReport, TransferResult
+from meshkit.transfer.report import Doubt, TransferReport, TransferResult
 
 __all__ = ["PoseTransfer", "transfer_pose"]
 
