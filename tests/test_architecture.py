@@ -14,7 +14,17 @@ from update_public_api import API_FILE, public_modules, public_names
 PACKAGE = Path(__file__).parents[1] / "meshkit"
 
 # component -> components of meshkit that it may import, at any depth of its code.
-FOUNDATION = {"_checks", "_compile", "_numerics", "_repr", "batching", "scatter", "topology", "neighbors"}
+FOUNDATION = {
+    "_checks",
+    "_compile",
+    "_connectivity",
+    "_numerics",
+    "_repr",
+    "batching",
+    "scatter",
+    "topology",
+    "neighbors",
+}
 MAY_IMPORT: dict[str, set[str]] = {
     "_checks": set(),
     "_compile": set(),
@@ -24,6 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "scatter": set(),
     "topology": {"batching", "scatter"},
     "neighbors": {"_numerics", "batching", "scatter"},
+    "_connectivity": {"_compile", "_numerics", "topology"},
     "descriptors": FOUNDATION,
     "ot": FOUNDATION,
     "norm": FOUNDATION,
