@@ -3,6 +3,7 @@
     python benchmarks/sinkhorn.py                                  # 6890 x 6890, every entry that is installed
     python benchmarks/sinkhorn.py --rows 27554 --entries literal stream
     python benchmarks/sinkhorn.py --batch 8 --entries stream
+    python benchmarks/sinkhorn.py --batch 32 --rows 128 --columns 128 --features 32 --entries literal keep stream
 
 Every entry runs in a process of its own, the processes take turns over several rounds, and the smallest CPU time
 (all threads, one by default) counts. Memory is what the peak of the process adds to its size before the first call.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from meshkit.deform.factor import SOLVERS, check_choice
 
-__all__ = ["ARAPInfo", "Options", "check_options", "refuse_partial_gradient", "warn_unconverged"]
+__all__ = ["ARAPInfo", "Options", "check_options"]
 
 DEFAULT_TOL = 1e-7
 
