@@ -250,7 +250,8 @@ class PoseTransferGenerator(nn.Module):
         whole = (verts, features, pair[2], descriptors)
         # An identity beside several poses comes as one mesh, expanded: its mirror image is one too.
         once = all(x is None or x.stride(0) == 0 for x in whole)
-        one, own, mask, known = (x[:1] if once and x is not None else x for x in whole)
+        one, own = (x[:1] if once else x for x in (verts, features))
+        mask, known = (x[:1] if once and x is not None else x for x in (pair[2], descriptors))
         mirrored = self.encode(one * one.new_tensor([-1.0, 1.0, 1.0]), mask=mask, descriptors=known)
         with torch.no_grad():  # which sides correspond is a choice, without a derivative
             partners = self.match(mirrored, own, identity_mask=mask, pose_mask=mask).argmax()
