@@ -35,7 +35,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "scatter": set(),
     "topology": {"batching", "scatter"},
     "neighbors": {"_numerics", "batching", "scatter"},
-    "_connectivity": {"_compile", "_numerics", "topology"},
     "descriptors": FOUNDATION,
     "ot": FOUNDATION,
     "norm": FOUNDATION,
