@@ -238,9 +238,9 @@ def test_claims_reserve_no_memory(tmp_path: Path) -> None:
 
 
 def test_what_trimesh_warns_of_is_an_error() -> None:
-    with pytest.raises(ValueError, match="damaged: ValueError of trimesh, odd numbers; copy or export it again"):
-        with trimesh_reads():
-            warnings.warn("odd numbers", RuntimeWarning, stacklevel=1)
+    message = "damaged: ValueError of trimesh, odd numbers; copy or export it again"
+    with pytest.raises(ValueError, match=message), trimesh_reads():
+        warnings.warn("odd numbers", RuntimeWarning, stacklevel=1)
     with trimesh_reads():  # how trimesh is written is no matter of the file
         warnings.warn("old code", DeprecationWarning, stacklevel=1)
 

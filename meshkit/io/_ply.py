@@ -108,7 +108,7 @@ def _least(kinds: dict[str, str]) -> int:
 
 
 def _first_numbers(stream: BinaryIO, claims: dict[str, int]) -> Indices:
-    """What the lines of the faces start with in text, -1 if it is no number; the lines of all elements must be there."""
+    """What the lines of faces start with in text, -1 if it is no number; the lines of all elements must be there."""
     before = sum(claims[element] for element in list(claims)[: list(claims).index("face")])
     starts = [line[:99].split()[:1] for line in islice(stream, sum(claims.values()))]
     _hold("lines, none of them empty,", sum(claims.values()), sum(map(bool, starts)))
