@@ -46,7 +46,7 @@ def read_ply(path: Path, _limit: int) -> Parsed:
     _hold("vertices", claims["vertex"], len(verts))
     _hold("faces", claims["face"], len(corners))
     if min(lengths) < 3:
-        raise ValueError(f"damaged: it has faces with less than three corners; {remedy}")
+        raise ValueError(f"damaged: it has faces with fewer than three corners; {remedy}")
     # trimesh takes the lists of binary data, and of lines with as many numbers, to be as long as the first.
     if (binary or next(iter(types["face"])) == name) and (wrong := np.flatnonzero(lengths != sizes)).size:
         first = wrong[0]
