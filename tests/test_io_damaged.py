@@ -15,12 +15,14 @@ import trimesh
 from meshkit.data import load_smpl
 from meshkit.io import MeshFileError, MeshFileWarning, load_mesh, save_mesh
 from meshkit.io._arrays import read_arrays
+from meshkit.io._trimesh import trimesh_reads
 
 BALL = trimesh.creation.icosphere(1)
 PLY = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face {}\n"
 FACES = "property list uchar int vertex_indices\nend_header\n"
 TEXT = PLY.format("ascii", 3, 1) + FACES
 BINARY = PLY.format("binary_little_endian", 3, 1) + FACES
+ROWS = "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 SOLID = "solid s\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
 
 
@@ -30,31 +32,30 @@ def content(kind: str) -> bytes:
     return data if isinstance(data, bytes) else data.encode()
 
 
-def quads_and_triangles(order: str) -> bytes:
+def binary_ply(order: str, polygons: list[list[int]]) -> bytes:
     """A binary PLY with other properties and elements around what is read."""
     header = "ply\r\nformat binary_{}_endian 1.0\r\ncomment x\r\nelement camera 2\r\nproperty short a\r\n"
-    header += "element strip 2\r\nproperty list ushort int8 i\r\nelement vertex 5\r\nproperty uchar red\r\n"
-    header += "property double z\r\nproperty double x\r\nproperty double y\r\nelement face 3\r\nproperty float area\r\n"
-    header += "property list uint ushort vertex_index\r\nproperty list uchar float uv\r\nend_header\r\n"
+    header += "element strip 1\r\nproperty list ushort int8 i\r\nelement vertex 5\r\nproperty uchar red\r\n"
+    header += f"property double z\r\nproperty double x\r\nproperty double y\r\nelement face {len(polygons)}\r\n"
+    header += "property float area\r\nproperty list uint ushort vertex_index\r\nproperty list uchar float uv\r\n"
+    header += "element edge 1\r\nproperty int vertex1\r\nproperty int vertex2\r\nend_header\r\n"
     sign, name = {"<": ("<", "little"), ">": (">", "big")}[order]
-    body = np.array([1, 2], f"{sign}i2").tobytes()
-    for strip in ([1, 2, 3], []):
-        body += np.array(len(strip), f"{sign}u2").tobytes() + np.array(strip, "i1").tobytes()
+    body = np.array([1, 2, 3], f"{sign}i2").tobytes() + bytes([1, 2, 3])
     for x, y, z in CORNERS:
         body += b"\7" + np.array([z, x, y], f"{sign}f8").tobytes()
-    for face in POLYGONS:
+    for face in polygons:
         body += np.array(0.5, f"{sign}f4").tobytes() + np.array(len(face), f"{sign}u4").tobytes()
         body += np.array(face, f"{sign}u2").tobytes() + b"\2" + np.array([0.5, 0.5], f"{sign}f4").tobytes()
-    return header.format(name).encode() + body
+    return header.format(name).encode() + body + np.array([0, 1], f"{sign}i4").tobytes()
 
 
 CORNERS = [[0, 0, 0], [1, 0, 0.25], [1, 1, 0], [0, 1, 0], [0.5, 2, 3]]
-POLYGONS = [[0, 1, 2], [0, 1, 2, 3], [2, 3, 4]]
+QUADS = [[0, 1, 2, 3], [1, 2, 3, 4]]
 
 
-@pytest.mark.parametrize("kind", ["obj", "off", "ply", "ply text", "stl", "stl text", "glb", "mixed.ply"])
+@pytest.mark.parametrize("kind", ["obj", "off", "ply", "ply text", "stl", "stl text", "glb", "quads.ply"])
 def test_cut_and_garbled_files_are_meshes_or_named(tmp_path: Path, kind: str) -> None:
-    whole = quads_and_triangles(">") if kind == "mixed.ply" else content(kind)
+    whole = binary_ply(">", QUADS) if kind == "quads.ply" else content(kind)
     file = tmp_path / f"m.{kind.split('.')[-1].split()[0]}"
     rng = np.random.default_rng(0)
     variants = [whole[: int(length)] for length in np.linspace(0, len(whole) - 1, 20)]
@@ -78,8 +79,9 @@ def test_cut_and_garbled_files_are_meshes_or_named(tmp_path: Path, kind: str) ->
                 assert text.startswith(f"{file}: ")
                 assert "\n" not in text
                 assert len(text) < len(str(file)) + 600
-                # Words of the readers below have no place in a message to a user.
-                assert not any(word in text for word in ("unmatched", "reshape", "unpack", "loadtxt", "NoneType"))
+                # Words of the readers below have no place in a message to a user, or are said to be theirs.
+                theirs = ("unmatched", "reshape", "unpack", "loadtxt", "NoneType")
+                assert " of trimesh, " in text or not any(word in text for word in theirs)
             else:
                 assert torch.isfinite(verts).all()
                 assert 0 <= faces.min() <= faces.max() < len(verts)
@@ -87,22 +89,34 @@ def test_cut_and_garbled_files_are_meshes_or_named(tmp_path: Path, kind: str) ->
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_ply_with_all_that_the_format_allows(tmp_path: Path, order: str) -> None:
-    (tmp_path / "m.ply").write_bytes(quads_and_triangles(order))
+def test_binary_ply_with_more_in_it(tmp_path: Path, order: str) -> None:
+    (tmp_path / "m.ply").write_bytes(binary_ply(order, QUADS))
     with pytest.warns(MeshFileWarning, match="4 faces in all"):
         verts, faces = load_mesh(tmp_path / "m.ply")
     assert verts.tolist() == CORNERS
-    assert faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3], [2, 3, 4]]
+    assert faces.tolist() == [[0, 1, 2], [0, 2, 3], [1, 2, 3], [1, 3, 4]]
 
 
-def test_text_ply_with_other_properties_first(tmp_path: Path) -> None:
-    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty uchar red\nproperty float x\nproperty float y\n"
-    header += "property float z\nelement edge 1\nproperty int a\nproperty int b\nelement face 1\nproperty list uchar "
+@pytest.mark.parametrize("sizes", [(4, 3, 3), (4, 3, 5)])  # the second has as many bytes as three quads
+def test_binary_ply_of_mixed_polygons_is_refused(tmp_path: Path, sizes: tuple[int, ...]) -> None:
+    header = PLY.format("binary_little_endian", 5, len(sizes)) + FACES
+    body = np.array(CORNERS, "<f4").tobytes()
+    body += b"".join(bytes([size]) + np.arange(size, dtype="<i4").tobytes() for size in sizes)
+    (tmp_path / "m.ply").write_bytes(header.encode() + body)
+    with pytest.raises(MeshFileError, match=r"export it with triangles: in binary all faces must have as many corners"):
+        load_mesh(tmp_path / "m.ply")
+
+
+def test_text_ply_with_more_in_it(tmp_path: Path) -> None:
+    header = "ply\nformat ascii 1.0\nelement vertex 4\nproperty uchar red\nproperty float x\nproperty float y\n"
+    header += "property float z\nelement edge 1\nproperty int a\nproperty int b\nelement face 2\nproperty list uchar "
     header += "float uv\nproperty int flags\nproperty list uchar uint vertex_index\nend_header\n"
-    (tmp_path / "m.ply").write_text(header + "9 0 0 0\n9 1 0 0\n9 0 1 0\n0 1\n2 .5 .5 7 3 2 1 0\n")
-    verts, faces = load_mesh(tmp_path / "m.ply")
-    assert verts.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
-    assert faces.tolist() == [[2, 1, 0]]
+    rows = "9 0 0 0\n9 1 0 0\n9 0 1 0\n9 0 1 1\n0 1\n2 .5 .5 7 4 0 1 2 3\n2 .5 .5 7 3 2 1 0\n"
+    (tmp_path / "m.ply").write_text(header + rows)
+    with pytest.warns(MeshFileWarning, match="3 faces in all"):
+        verts, faces = load_mesh(tmp_path / "m.ply")
+    assert verts.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 1, 1]]
+    assert faces.tolist() == [[0, 1, 2], [0, 2, 3], [2, 1, 0]]
 
 
 @pytest.mark.parametrize(
@@ -110,46 +124,49 @@ def test_text_ply_with_other_properties_first(tmp_path: Path) -> None:
     [
         ("m.ply", b"", "the file is empty"),
         ("m.ply", "solid\n", "the first line is 'solid', not ply"),
-        ("m.ply", TEXT[:60], "the file ends too early; copy or export it again: there is no end_header"),
-        ("m.ply", TEXT.replace("format ascii", "format utf8"), "line 2, 'format utf8 1.0': no line of the header"),
-        ("m.ply", TEXT.replace("vertex 3", "vertex -3"), "line 3, 'element vertex -3': no line of the header"),
-        ("m.ply", TEXT.replace("float y", "float x"), "line 5, 'property float x': vertex has two properties of this"),
-        ("m.ply", TEXT.replace("float y", "half y"), "line 5, 'property half y': 'half' is no type of a PLY file"),
-        ("m.ply", TEXT.replace("format ascii 1.0\n", ""), "its header has no line of the format"),
-        ("m.ply", TEXT.replace("element vertex", "element point"), "its header has no element vertex"),
-        ("m.ply", TEXT.replace("float y", "float v"), "no property y; they have x, v, z"),
-        ("m.ply", TEXT.replace("float z", "list uchar float z"), "its vertices have properties that are lists"),
-        ("m.ply", TEXT.replace("element face", "element vertex"), "its header names an element twice"),
+        ("m.ply", TEXT[:60], "'prope' is no line of the header of a PLY file; copy or export it again"),
+        ("m.ply", TEXT.replace("end_header\n", ""), "the file ends too early; copy .* again: there is no end_header"),
+        ("m.ply", TEXT.replace("format ascii", "format utf8"), "the second line is 'format utf8 1.0'; its format"),
+        ("m.ply", TEXT.replace("format", "comment x\nformat"), "the second line is 'comment x'; its format, as"),
+        ("m.ply", TEXT.replace("vertex 3", "vertex -3"), "'element vertex -3' is no line of the header of a PLY file"),
+        ("m.ply", TEXT.replace("float y", "float x"), "'property float x' is no line of the header of a PLY file"),
+        ("m.ply", TEXT.replace("element face", "element vertex"), "'element vertex 1' is no line of the header"),
+        ("m.ply", TEXT.replace("end_header", "comment end_header"), "'comment end_header' is no line of the header"),
+        ("m.ply", TEXT.replace("float y", "half y") + ROWS, "damaged: KeyError of trimesh, 'half'; copy or export it"),
+        ("m.ply", TEXT.replace("element vertex", "element point"), "it has no vertices with x, y, z"),
+        ("m.ply", TEXT.replace("float y", "float v"), "it has no vertices with y"),
+        ("m.ply", TEXT.replace("float z", "list uchar float z"), "it has no vertices with z"),
         ("m.ply", TEXT.replace("element face", "element tristrips"), "its faces are triangle strips; export it with"),
+        ("m.ply", TEXT.replace("element face 1", "element face 0"), "no faces; a point cloud must be meshed first"),
         ("m.ply", TEXT.replace("vertex_indices", "corners"), "no list of integers vertex_indices or vertex_index"),
-        ("m.ply", TEXT + "0 0 0\n1 0\n0 1 0\n3 0 1 2\n", "line 11, '1 0': a vertex is three numbers; mend that line"),
-        ("m.ply", TEXT + "0 0 0\n1 0\n", "line 11, '1 0': a vertex is three numbers; it is the last line, so the file"),
-        ("m.ply", TEXT + "0 0 0\n", "the file ends too early: 1 of 3 vertices are there; copy or export it again"),
-        ("m.ply", TEXT + "0 0 0\n1 0 0\n0 1 0\n2 0 1\n", "line 13, '2 0 1': a face is its number of corners"),
-        (
-            "m.ply",
-            TEXT + "0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n",
-            "line 13, '3 0 1 3': the file has 3 vertices, counted from 0",
-        ),
-        (
-            "m.ply",
-            BINARY.encode() + bytes(30),
-            "cut short: the vertices end at byte 205, the file at 199; copy or export it again",
-        ),
-        ("m.ply", BINARY.encode() + bytes(36), "cut short: the faces end at byte 206 or later, the file at 205"),
-        ("m.ply", BINARY.encode() + bytes(37), r"face 0 \(counting from 0, at byte 205\): it has 0 corners, three or"),
-        ("m.ply", BINARY.encode() + bytes(36) + b"\3\0", "a list of 3 entries ends at byte 218 of 207; copy or export"),
+        ("m.ply", TEXT.replace("uchar int", "uchar float"), "no list of integers vertex_indices or vertex_index"),
+        ("m.ply", TEXT + ROWS.replace("1 0 0", "1 0"), "damaged: ValueError of trimesh, .*; copy or export it again"),
+        ("m.ply", TEXT + ROWS.replace("1 0 0", "1 b 0"), "damaged: ValueError of trimesh, .*; copy or export it again"),
+        ("m.ply", TEXT + ROWS.replace("1 0 0\n", "1 0 0\n\n"), "claims 4 lines, none of them empty, and 3 are there"),
+        ("m.ply", TEXT + "0 0 0\n", "its header claims 4 lines, none of them empty, and 1 are there; copy or export"),
+        ("m.ply", TEXT + ROWS.replace("3 0 1 2", "2 0 1"), "has faces with fewer than three corners; copy or export"),
+        ("m.ply", TEXT + ROWS.replace("3 0 1 2", "4 0 1 2"), "face 0 says it has 4 corners, trimesh reads 3; copy or"),
+        ("m.ply", BINARY.encode() + bytes(30), "its header claims 37 bytes or more and 30 are there; copy or export"),
+        ("m.ply", BINARY.encode() + bytes(36), "its header claims 37 bytes or more and 36 are there; copy or export"),
+        ("m.ply", BINARY.encode() + bytes(38), "PLY is unexpected length!; copy it again, or export it with triangles"),
+        ("m.ply", BINARY.encode() + bytes(37), "it has faces with fewer than three corners; copy it again, or export"),
+        ("m.ply", BINARY.encode() + bytes(36) + b"\3\0", "PLY is unexpected length!; copy it again, or export it"),
         ("m.stl", b"", "the file is empty"),
         ("m.stl", bytes(50), "cut short: 50 bytes, a binary STL has 84 or more"),
+        ("m.stl", bytes(80) + b"\2\0\0\0" + bytes(99), "of 2 triangles has 184 bytes, this file 183; copy or export"),
+        ("m.stl", SOLID, "there is no endsolid at its end; copy or export it again"),
+        ("m.stl", SOLID + "endsolid\n" + SOLID, "there is no endsolid at its end; copy or export it again"),
         (
             "m.stl",
-            bytes(80) + b"\2\0\0\0" + bytes(99),
-            "a binary STL of 2 triangles has 184 bytes, this file 183; copy",
+            SOLID.replace("vertex 1 0", "vertex 1") + "endsolid\n",
+            "damaged: ValueError of trimesh, .*; copy or",
         ),
-        ("m.stl", SOLID, "there is no endsolid after 1 triangle; copy or export it again"),
-        ("m.stl", SOLID.replace("vertex 1 0", "vertex 1"), "line 5, 'vertex 1 0': a vertex is three numbers"),
-        ("m.stl", SOLID.replace("vertex 1 0 0\n", ""), "line 7, 'endfacet': triangle 1 has not three vertices"),
-        ("m.stl", SOLID.replace("outer", "inner"), "line 3, 'inner loop': no line of an STL file starts like this"),
+        (
+            "m.stl",
+            SOLID.replace("vertex 1 0 0\n", "") + "endsolid",
+            "damaged: ValueError of trimesh, .*; copy or export",
+        ),
+        ("m.stl", SOLID.replace("endfacet", "") + "endsolid\n", "0 triangles should be there, with 3 corners; copy"),
         ("m.glb", b"", "the file is empty"),
         ("m.glb", b"glTF\2\0\0\0", "cut short: 8 bytes, its header alone has 20"),
     ],
@@ -220,13 +237,12 @@ def test_claims_reserve_no_memory(tmp_path: Path) -> None:
         assert peak < 2**24
 
 
-def test_reader_of_ply_agrees_with_trimesh(tmp_path: Path) -> None:
-    for kind in ("ply", "ply text"):
-        (tmp_path / "m.ply").write_bytes(content(kind))
-        verts, faces = load_mesh(tmp_path / "m.ply")
-        mesh = trimesh.load_mesh(tmp_path / "m.ply", process=False)
-        np.testing.assert_array_equal(verts.numpy(), mesh.vertices.astype(np.float32))
-        np.testing.assert_array_equal(faces.numpy(), mesh.faces)
+def test_what_trimesh_warns_of_is_an_error() -> None:
+    message = "damaged: ValueError of trimesh, odd numbers; copy or export it again"
+    with pytest.raises(ValueError, match=message), trimesh_reads():
+        warnings.warn("odd numbers", RuntimeWarning, stacklevel=1)
+    with trimesh_reads():  # how trimesh is written is no matter of the file
+        warnings.warn("old code", DeprecationWarning, stacklevel=1)
 
 
 def test_unreadable_files_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,22 +102,22 @@ def read_rows(lines: Iterator[Row], count: int, what: str, read: Callable[[list[
         done += len(rows)
 
 
-def add_verts(rows: list[Row], ends: bool, mesh: Growing, columns: tuple[int, ...] = (0, 1, 2)) -> None:
-    """Vertices, one in a line, with their coordinates in ``columns``."""
+def add_verts(rows: list[Row], ends: bool, mesh: Growing) -> None:
+    """Vertices, one in a line."""
     try:
-        mesh.add_verts(table([row for _, row in rows], float, columns))
+        mesh.add_verts(table([row for _, row in rows], float, (0, 1, 2)))
     except ValueError:
         verts = []
         for number, row in rows:
             try:
                 fields = row.split()
-                verts.append([float(fields[column]) for column in columns])
+                verts.append([float(fields[column]) for column in range(3)])
             except (ValueError, IndexError):
                 raise blame(number, row, VERTEX_IS, last=ends and number == rows[-1][0]) from None
         mesh.add_verts(np.array(verts))
 
 
-def corners_of(row: bytes) -> list[int]:
+def _corners(row: bytes) -> list[int]:
     """Corners of a face whose number of corners comes first; raises a ``ValueError`` if it is not one."""
     fields = row.split()
     size, *corners = map(int, fields[: int(fields[0]) + 1] if fields else [])  # a colour may follow
@@ -126,22 +126,21 @@ def corners_of(row: bytes) -> list[int]:
     return corners
 
 
-def add_faces(rows: list[Row], ends: bool, mesh: Growing, corners: Callable[[bytes], list[int]] = corners_of) -> None:
+def add_faces(rows: list[Row], ends: bool, mesh: Growing) -> None:
     """Faces, one in a line, where all vertices have been read before."""
     triangles = None
-    if corners is corners_of:
-        try:
-            columns = table([row for _, row in rows], np.int64, (0, 1, 2, 3))
-            triangles = columns[:, 1:] if (columns[:, 0] == 3).all() else None
-        except ValueError:
-            pass
+    try:
+        columns = table([row for _, row in rows], np.int64, (0, 1, 2, 3))
+        triangles = columns[:, 1:] if (columns[:, 0] == 3).all() else None
+    except ValueError:
+        pass
     if triangles is not None and not outside(triangles, mesh.count):
         mesh.add_polygons(triangles)
         return
     polygons, strange = [], []
     for number, row in rows:
         try:
-            polygons.append(corners(row))
+            polygons.append(_corners(row))
         except (ValueError, IndexError):
             raise blame(number, row, _FACE_IS, last=ends and number == rows[-1][0]) from None
         if not 0 <= min(polygons[-1]) <= max(polygons[-1]) < mesh.count:

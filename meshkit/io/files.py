@@ -1,8 +1,8 @@
 """Mesh files in and out, with the order and the number of the vertices kept.
 
 Pose transfer, correspondences and per-vertex errors all rest on the row order of the vertices, so nothing here merges,
-reorders or drops a vertex. All formats but GLB have a reader of their own for that reason: general readers split an OBJ
-by material and repeat vertices along texture seams, and do not say where a damaged file is damaged.
+reorders or drops a vertex. OBJ and OFF have readers of their own for that reason: general readers split an OBJ by
+material and repeat vertices along texture seams. PLY, STL and GLB are read through trimesh, between checks.
 """
 
 import os
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from meshkit.io._binary_readers import read_glb
+from meshkit.io._glb import read_glb
 from meshkit.io._obj import read_obj
 from meshkit.io._off import read_off
 from meshkit.io._ply import read_ply

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from meshkit.io import MeshFileError, SurfaceBinding
-from meshkit.io._binary_readers import read_scene
+from meshkit.io._glb import read_scene
 from meshkit.io.report import counted
 from meshkit.transfer._choose import Weights
 from meshkit.transfer._frames import among, rotations, turns_about

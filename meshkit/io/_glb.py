@@ -1,4 +1,4 @@
-"""Reader of GLB files, through trimesh, with checks of what trimesh takes on trust."""
+"""GLB files, through trimesh, with checks of what trimesh takes on trust."""
 
 import json
 import struct
@@ -9,6 +9,7 @@ import numpy as np
 
 from meshkit.io._lines import COPY_AGAIN, EMPTY
 from meshkit.io._mesh import Parsed
+from meshkit.io._trimesh import trimesh_reads
 
 _BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}  # of a component
 _WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -34,11 +35,8 @@ def read_scene(path: Path, limit: int) -> Any:
     import trimesh
 
     _check_tree(*_chunks(path), path.stat().st_size)
-    try:
-        with np.errstate(all="ignore"):  # what overflows becomes infinite, and is reported as such
-            scene = trimesh.load_scene(path, process=False, skip_materials=True)
-    except Exception as error:  # trimesh raises what its readers raise
-        raise ValueError(f"damaged: {type(error).__name__} of trimesh, {error}; {COPY_AGAIN}") from error
+    with trimesh_reads():
+        scene = trimesh.load_scene(path, process=False, skip_materials=True)
     uses = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
     bytes_needed = 24 * sum(len(part.vertices) + len(getattr(part, "faces", ())) for part in uses)
     if bytes_needed > max(limit, 2**20):  # a small file can place one mesh many times
