@@ -54,8 +54,9 @@ def both(device: str, inputs: dict[str, Any], **options: Any) -> list[tuple[torc
     results = []
     for place, solver in (("cpu", "splu"), (device, "dense")):
         own = {k: v.to(place) if isinstance(v, torch.Tensor) else v for k, v in inputs.items()}
-        for value in own.values():
-            if isinstance(value, torch.Tensor) and value.is_floating_point():
+        for name, value in own.items():
+            refused = options.get("grad") == "unroll" and name == "verts"
+            if isinstance(value, torch.Tensor) and value.is_floating_point() and not refused:
                 value.requires_grad_()
         x, info = arap_deform(**own, solver=solver, **options)
         assert x.device.type == place

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import assert_near, rand, scattered_mask
+from literal_ot import one_by_one  # noqa: F401
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 

@@ -99,6 +99,7 @@ def chamfer_distance(
         X-DualNet reports CD without a definition and its released code does not compute it; this is the usual one.
 
     Example:
+        >>> import torch
         >>> p, q = torch.zeros(1, 1, 3), torch.tensor([[[2.0, 0, 0], [4, 0, 0]]])
         >>> chamfer_distance(p, q)  # 2² + (2² + 4²) / 2
         tensor([14.])

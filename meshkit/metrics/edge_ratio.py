@@ -34,6 +34,7 @@ def edge_ratio(
         ValueError: if shapes, dtypes or face indices do not fit, or ``min_length`` is negative.
 
     Example:
+        >>> import torch
         >>> mesh = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
         >>> edge_ratio(1.5 * mesh, mesh, torch.tensor([[0, 1, 2]]))
         tensor([0.5000])
