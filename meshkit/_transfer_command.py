@@ -74,6 +74,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--report", type=Path, metavar="FILE", help="save the reports, with all numbers, as JSON")
     made.add_argument("--skip-bad", action="store_true", help="of many poses, leave out those that cannot be used")
     made.add_argument("--device", default="cpu", help="cpu, cuda, ... (default: cpu)")
+    made.add_argument("--threads", type=int, default=0, metavar="N", help="threads on the CPU, 0 for PyTorch's choice")
     made.add_argument("--no-picture", action="store_true", help="no .png beside the result")
     made.add_argument("--no-html", action="store_true", help="no .html page beside the result")
     made.add_argument("--quiet", action="store_true", help="print warnings only")
@@ -116,6 +117,8 @@ def check(args: argparse.Namespace) -> None:
         up, facing = getattr(args, f"{role}_up"), getattr(args, f"{role}_facing")
         if up and facing and up[1] == facing[1]:
             raise ValueError(f"--{role}-up {up} and --{role}-facing {facing} must be at right angles")
+    if args.threads < 0:
+        raise ValueError(f"--threads cannot be negative, got {args.threads}")
     if args.refine is not None and not 0 < args.refine < math.inf:
         raise ValueError(f"--refine must be a positive weight, got {args.refine:g}; --no-refine leaves refining out")
     if args.refine is not None and args.no_refine:

@@ -509,6 +509,13 @@ def _template_order(batch: PairBatch, truth: torch.Tensor) -> torch.Tensor:
     return torch.cdist(batch.ground_truth, truth, compute_mode="donot_use_mm_for_euclid_dist").argmin(2)
 
 
+def test_tables_are_indexed_by_batches(humans):
+    with pytest.raises(ValueError, match=r"identity must be a batch, a tensor such as torch.tensor\(\[3\]\), got 3"):
+        humans(3, torch.tensor([10]))
+    with pytest.raises(ValueError, match=r"pose must be a batch.*got list"):
+        humans(torch.tensor([3]), [10])
+
+
 def test_tables_are_indexed_by_whole_numbers(humans):
     rows = torch.tensor([1, 2])
     with pytest.raises(ValueError, match=r"identities must be whole numbers, rows of .* got torch\.float32"):

@@ -896,6 +896,7 @@ def command(*words: object) -> None:
         (["folder", "id.obj"], "folder: a folder; the identity is one mesh"),
         (["id.obj", "id.obj", "--refine", "-1"], "--refine must be a positive weight, got -1"),
         (["id.obj", "id.obj", "--refine", "1", "--no-refine"], "exclude each other"),
+        (["id.obj", "id.obj", "--threads", "-1"], "--threads cannot be negative, got -1"),
         (["id.obj", "id.obj", "--pose-up", "+z", "--pose-facing", "-z"], "--pose-facing -z must be at right angles"),
         (["id.obj", "id.obj", "--weights", "none"], "weights must be 'auto'"),
         (["bad.obj", "id.obj"], "bad.obj: not a readable OBJ mesh"),
@@ -1098,7 +1099,10 @@ def test_the_command_writes_mesh_picture_and_page(person, mover, tmp_path, monke
     save_mesh(tmp_path / "id.ply", *person)
     save_mesh(tmp_path / "pose.obj", *mover)
     axes = ["--identity-up=+z", "--identity-facing=-y", "--pose-up=+z", "--pose-facing=-y", "--weights", "copy"]
-    command(tmp_path / "id.ply", tmp_path / "pose.obj", "-o", tmp_path / "r" / "out.obj", *axes)
+    threads = []
+    monkeypatch.setattr(torch, "set_num_threads", threads.append)
+    command(tmp_path / "id.ply", tmp_path / "pose.obj", "-o", tmp_path / "r" / "out.obj", "--threads", "3", *axes)
+    assert threads == [3]
     verts, faces = load_mesh(tmp_path / "r" / "out.obj")
     assert_near(verts, person[0] - standing_point(person[0]) + standing_point(mover[0]), 1e-4)
     assert torch.equal(faces, person[1])

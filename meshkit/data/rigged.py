@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -204,6 +205,7 @@ class RiggedModel(nn.Module):
         return maps[:, :-1]
 
     def _betas(self, identity: Tensor) -> Tensor:
+        _check_tensor(identity, "identity")
         if identity.is_floating_point():
             if identity.dim() != 2 or identity.shape[1] != len(self.shape_dirs):
                 raise ValueError(f"coefficients must be (B, {len(self.shape_dirs)}), got {tuple(identity.shape)}")
@@ -211,6 +213,7 @@ class RiggedModel(nn.Module):
         return _rows(self.identities, identity, "identity")
 
     def _rotations(self, pose: Tensor) -> Tensor:
+        _check_tensor(pose, "pose")
         if not pose.is_floating_point():
             pose = _rows(self.poses, pose, "pose")
         if pose.dim() == 3 and pose.shape[1:] == (self.num_joints, 3):
@@ -221,6 +224,12 @@ class RiggedModel(nn.Module):
             f"pose must be (B,) integers, (B, {self.num_joints}, 3) rotation vectors or (B, {self.num_joints}, 3, 3) "
             f"matrices, got {tuple(pose.shape)}"
         )
+
+
+def _check_tensor(value: Any, name: str) -> None:
+    if not isinstance(value, Tensor):
+        said = f"{value!r}" if isinstance(value, int) else type(value).__name__
+        raise ValueError(f"{name} must be a batch, a tensor such as torch.tensor([3]), got {said}")
 
 
 def check_parents(parents: list[int]) -> None:

@@ -41,6 +41,8 @@ def run(args: argparse.Namespace, written: list[Path]) -> None:
         args: what :func:`meshkit._transfer_command.check` found nothing wrong with.
         written: to which every result is added once it is complete.
     """
+    if args.threads:
+        torch.set_num_threads(args.threads)
     many = is_sequence(args.pose)
     _transfer_command.check_out(args.out, many)
     meshes = read_sequence(args.pose) if many else [args.pose]
