@@ -1326,7 +1326,7 @@ def test_wrong_axes_are_noticed_where_they_were_given(fine_transfer):
         warnings = transfer(pose, pose_up=up, pose_facing=facing).report.warnings
         said = f"pose: the axes given (up {up}, facing {facing}) seem wrong: leave them out to have them found"
         noticed += said in warnings
-    assert noticed >= 1
+    assert noticed >= 2
 
 
 def small_net() -> PretrainedTransfer:

@@ -63,8 +63,8 @@ def main() -> None:
             rows = agreements(
                 rest, ready.simple.verts, ready.simple.faces, descriptors=ready.descriptors, candidates=turns
             )  # the first is right
-            given["right, in doubt"] += bool(rows[0, 0] < AGREEMENT)
-            given["wrong, in doubt"] += int((rows[1:, 0] < AGREEMENT).sum())
+            given["right, in doubt"] += bool(rows[0, 0] < AGREEMENT[kind])
+            given["wrong, in doubt"] += int((rows[1:, 0] < AGREEMENT[kind]).sum())
             for turn in turns:  # a candidate turns the turned mesh as the product of both turns this one
                 order = [int((turns == candidate @ turn).all(-1).all(-1).int().argmax()) for candidate in turns]
                 best, clear = choose(rows[order], favoured, doubt=DOUBT[kind])

@@ -20,8 +20,8 @@ __all__ = ["RestBody", "agreements", "agrees", "choose", "find_rotation"]
 DOUBT = {"humans": 0.05, "animals": 0.08}
 """Lead in score below which an orientation that was found is in doubt, for each kind of body."""
 
-AGREEMENT = 0.25
-"""Correlation of normals below which an orientation that was given is in doubt."""
+AGREEMENT = {"humans": 0.4, "animals": 0.25}
+"""Correlation of normals below which an orientation that was given is in doubt, for each kind of body."""
 
 _CLEAR = 0.05  # score by which another orientation must beat the usual ones
 
@@ -137,7 +137,7 @@ def agrees(rest: RestBody, verts: Tensor, faces: Tensor, *, descriptors: Tensor 
     if not rest.can_match:
         return True
     row = agreements(rest, verts, faces, descriptors=descriptors, candidates=rotation[None])
-    return float(row[0, 0]) >= AGREEMENT
+    return float(row[0, 0]) >= AGREEMENT[rest.kind]
 
 
 @torch.no_grad()
