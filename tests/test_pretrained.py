@@ -407,3 +407,10 @@ def test_shipped_weights_take_float64():
     a, b = body(torch.tensor([1, 2]), torch.tensor([3, 4]))
     with torch.no_grad():
         assert (net(a.double(), b.double(), **sides) - net(a, b, **sides)).abs().max() < 1e-3
+
+
+def test_faces_of_the_wrong_mesh_are_told_by_the_mesh() -> None:
+    body, finer = load_shipped("humans", 1000)[0], load_shipped("humans", 2000)[0]
+    identity, pose = body(torch.tensor([3]), torch.tensor([10]))[0], finer(torch.tensor([5]), torch.tensor([7]))[0]
+    with pytest.raises(ValueError, match=r"identity: face indices must lie in \[0, 1000\)"):
+        load_pretrained("corenet3d-humans")(identity, pose, identity_faces=finer.faces, pose_faces=body.faces)

@@ -532,8 +532,10 @@ def test_a_runs_folder_gives_weights(tmp_path):
 
 def test_unusable_meshes_and_options_are_refused(person, mover, tmp_path, monkeypatch):
     net = copier()
-    with pytest.raises(ValueError, match="weights must be 'auto', the folder of a run, or one of"):
+    with pytest.raises(ValueError, match="weights must be 'auto', the folder of a run, or shipped weights by their"):
         transfer_pose(person, mover, weights="nothing")
+    with pytest.raises(ValueError, match="got 'corenet-human': did you mean corenet3d-humans"):
+        transfer_pose(person, mover, weights="corenet-human")
     with pytest.raises(ValueError, match="frame must be"):
         PoseTransfer(person, weights=net, frame="world")
     with pytest.raises(ValueError, match="refine must be"):
@@ -985,7 +987,10 @@ def test_the_command_leaves_out_bad_poses(suffix, person, poses_some_bad, tmp_pa
     assert error.startswith("error: 3 of 6 poses cannot be used;") and "--skip-bad" in error
     assert [Path(line.split(":")[0]).name for line in error.splitlines()[1:]] == ["p_1.obj", "p_2.obj", "p_4.obj"]
     assert not out.parent.exists()
-    command(*words, "--skip-bad")
+    command(*words, "--skip-bad", "--report", tmp_path / "report.json")
+    reports = json.loads((tmp_path / "report.json").read_text())
+    names = [Path(report["pose"]["name"]).name for report in reports if report.get("left_out")]
+    assert len(reports) == 6 and names == ["p_1.obj", "p_2.obj", "p_4.obj"]
     error = capsys.readouterr().err
     assert error.startswith("warning: 3 of 6 poses are left out:\n  ") and len(error.splitlines()) == 4
     if suffix == ".obj":

@@ -154,7 +154,10 @@ class PretrainedTransfer(nn.Module):
         if verts.shape[1] < k:
             raise ValueError(f"{name} has {verts.shape[1]} vertices; these weights look at {k} neighbours of each")
         if descriptors is None:
-            descriptors = self.describe(verts, faces, mask)
+            try:
+                descriptors = self.describe(verts, faces, mask)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from error
         elif descriptors.dim() == 2:
             descriptors = descriptors[None]
         centred = center(verts, mask)

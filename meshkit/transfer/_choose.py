@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from meshkit.models import PretrainedTransfer, load_generator, load_pretrained, pretrained_names
+from meshkit.models.pretrained import instead_of
 from meshkit.transfer._open import OpenedMesh
 
 __all__ = ["Choice", "Weights", "choose_weights", "load_weights"]
@@ -78,8 +79,8 @@ def load_weights(weights: str | os.PathLike[str], device: torch.device | str = "
     folder = Path(weights)
     if not folder.is_dir():
         raise ValueError(
-            f"weights must be 'auto', the folder of a run, or one of {', '.join(pretrained_names()) or '(none)'}; "
-            f"got {os.fspath(weights)!r}"
+            "weights must be 'auto', the folder of a run, or shipped weights by their name; "
+            f"got {os.fspath(weights)!r}{instead_of(os.fspath(weights))}"
         )
     generator, config = load_generator(folder)
     return PretrainedTransfer(generator, config, card=_facts(folder)).to(device).eval()

@@ -173,6 +173,9 @@ class _Output:
             if not args.quiet and kind is None:
                 print(f"{out}: {len(self._frames)} poses of {len(self._frames[0])} vertices")
         if args.report is not None and self._reports:
+            done = {report["pose"]["name"] for report in self._reports}
+            missing = [] if kind is not None else [name for name in self._files if name not in done]
+            left_out = [{"file": None, "pose": {"name": name}, "left_out": True} for name in missing]
             with atomic_write(args.report) as path:
-                path.write_text(json.dumps(self._reports, indent=1) + "\n", encoding="utf-8")
+                path.write_text(json.dumps([*self._reports, *left_out], indent=1) + "\n", encoding="utf-8")
             self._written.append(args.report)
