@@ -82,8 +82,16 @@ def kept(file: Path, make: Callable[[], Any]) -> Any:
 def fingerprint(name: str, out: Path) -> str:
     """A few digits that change with the weights of a run, or with shipped ones."""
     file = out / name / "model.safetensors"
-    if not file.exists():
-        file = Path(str(files("meshkit.weights") / f"{name}.safetensors"))
+    return digest(file if file.exists() else shipped_file(name))
+
+
+def shipped_file(name: str) -> Path:
+    """The file of shipped weights."""
+    return Path(str(files("meshkit.weights") / f"{name}.safetensors"))
+
+
+def digest(file: Path) -> str:
+    """A few digits that change with a file."""
     return hashlib.sha256(file.read_bytes()).hexdigest()[:8] if file.exists() else "none"
 
 

@@ -24,11 +24,13 @@ from _run import UserError, guard
 from _tables_measure import (
     METRICS,
     copies,
+    digest,
     fingerprint,
     generator_of,
     kept,
     measure,
     seconds_per_transfer,
+    shipped_file,
     test_pairs,
     transferred,
 )
@@ -165,7 +167,7 @@ def tables(cfg: Config, done: list[Job]) -> dict[str, list[Row]]:
 
 def measured_once(cfg: Config) -> dict[str, Any]:
     """The time of a transfer on this many threads; noise and triangulations, of the weights that are shipped now."""
-    weights = "-".join(fingerprint(name, cfg.out) for name in WEIGHTS)
+    weights = "-".join(digest(shipped_file(name)) for name in WEIGHTS)
     return {
         name: kept(cfg.out / "figures" / f"{name}-{of}.json", make)
         for name, of, make in (

@@ -106,6 +106,14 @@ def test_a_target_shrunk_to_the_axis_regains_its_thickness() -> None:
 
 
 @BOTH
+def test_far_from_the_origin(deform: Any) -> None:
+    v = rand(1, 40, 3).float()
+    target = v @ rotation(5).float().mT
+    moved = deform(v + 1000, target - 1000, radius=1.5)
+    torch.testing.assert_close(moved, target - 1000, atol=2e-3, rtol=0)
+
+
+@BOTH
 def test_features_keep_parts_apart_that_pass_close_to_each_other(deform: Any) -> None:
     left, right = rand(30, 3, seed=1) * 0.1, rand(30, 3, seed=2) * 0.1 + torch.tensor([0.2, 0, 0])
     rest = torch.cat([left, right])[None]
@@ -199,5 +207,6 @@ def test_errors(arguments: tuple, message: str, deform: Any) -> None:
 
 
 def test_a_weight_must_be_positive() -> None:
-    with pytest.raises(ValueError, match=r"weight must be positive, got 0\.0"):
-        poisson_deform(torch.zeros(1, 4, 3), torch.zeros(1, 4, 3), radius=1.0, weight=0.0)
+    for weight in (0.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match=f"weight must be positive and finite, got {weight}"):
+            poisson_deform(torch.zeros(1, 4, 3), torch.zeros(1, 4, 3), radius=1.0, weight=weight)

@@ -78,7 +78,7 @@ def arap_deform(
         max_iter: evaluations, or iterations, at most.
         tol: stop at this residual (see :class:`ARAPInfo`). The rotations of "lbfgs" are float32 unless `verts` are
             float64 and `tol` is below 1e-7, or the batch is solved at once. 0 asks "local_global" for all iterations.
-        grad: "implicit" differentiates the minimum, exact only at one: a warning tells where `tol` was not met;
+        grad: "implicit" differentiates the minimum, exact only at one: a warning tells of residuals above tol and 1e-7;
             converge further, or take "unroll", which records the iterations of "local_global" and differentiates them
             with respect to `handle_pos` and `soft_targets`, and refuses `verts` and `soft_weights` that want a
             gradient; "none" records nothing.

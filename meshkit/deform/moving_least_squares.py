@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from meshkit.deform.neighbourhoods import check_target, local_rotations, neighbour_weights
+from meshkit.deform.neighbourhoods import centred, check_target, local_rotations, neighbour_weights
 
 __all__ = ["rigid_moving_least_squares"]
 
@@ -53,14 +53,12 @@ def rigid_moving_least_squares(
         True
     """
     check_target(rest, target, radius)
-    if mask is not None:
-        rest, target = rest.masked_fill(~mask[..., None], 0.0), target.masked_fill(~mask[..., None], 0.0)
     with torch.autocast(rest.device.type, enabled=False):
         dtype = torch.promote_types(torch.promote_types(rest.dtype, target.dtype), torch.float32)
-        v, t = rest.to(dtype), target.to(dtype)
+        v, t, middle = centred(rest.to(dtype), target.to(dtype), mask)
         q = neighbour_weights(v.detach(), radius, mask, features)
         rotation, mean_v, mean_t = local_rotations(v, t, q, mask)
         shift = mean_t - (rotation @ mean_v[..., None])[..., 0]
         motion = q.mT @ torch.cat([rotation.flatten(2), shift], 2) / q.sum(1)[..., None]
-        moved = (motion[..., :9].unflatten(2, (3, 3)) @ v[..., None])[..., 0] + motion[..., 9:]
+        moved = (motion[..., :9].unflatten(2, (3, 3)) @ v[..., None])[..., 0] + motion[..., 9:] + middle
     return moved.to(target.dtype) if mask is None else moved.to(target.dtype).masked_fill(~mask[..., None], 0.0)

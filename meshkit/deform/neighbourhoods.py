@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from meshkit.batching import masked_mean
 from meshkit.deform.rotation import closest_rotation
 
 __all__: list[str] = []
@@ -16,6 +17,15 @@ def check_target(rest: Tensor, target: Tensor, radius: float) -> None:
         raise ValueError(f"rest and target must both be (B, N, 3), got {tuple(rest.shape)} and {tuple(target.shape)}")
     if not radius > 0:
         raise ValueError(f"radius must be positive, got {radius}")
+
+
+def centred(v: Tensor, t: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Shape and target about their means, padding as 0, and the mean (B, 1, 3) of the target."""
+    middle = masked_mean(t, mask)[:, None]
+    v, t = v - masked_mean(v, mask)[:, None], t - middle
+    if mask is not None:
+        v, t = v.masked_fill(~mask[..., None], 0.0), t.masked_fill(~mask[..., None], 0.0)
+    return v, t, middle
 
 
 def local_rotations(v: Tensor, t: Tensor, q: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:

@@ -102,6 +102,8 @@ def sinkhorn_divergence(
     if not isinstance(eps, int | float):
         raise ValueError(f"eps must be a number, got {type(eps).__name__}; use anneal to lower it in steps")
 
+    read_options(eps, n_iters, tol, None, "unroll", domain, store)  # refuses what makes no sense
+
     def transport(first: Side, second: Side, dual: Literal["between", "within"]) -> Tensor:
         schedule: float | list[float] = eps
         if anneal is not None and domain != "kernel" and eps > 0:

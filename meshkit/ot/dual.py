@@ -19,8 +19,13 @@ from meshkit.ot.tiles import Reference
 
 __all__: list[str] = []  # internal: meshkit.ot lists what is public
 
-_WINDOW = 10  # iterations between two estimates of the rate
+_WINDOW, _LONGER = 10, 4.0  # iterations between two estimates of the rate, and of 1 / (2 - omega) if that is more
 _SLOWEST = 0.9999  # rate of the plain iterations that omega is made for at most: 1.98
+_MARGIN, _GROWTH, _FALL = (
+    0.1,
+    8.0,
+    0.98,
+)  # how near q may come to omega - 1; growth of 1 / (1 - rate); fall of omega - 1
 
 
 @torch.no_grad()
@@ -28,15 +33,17 @@ def iterate_between(kernel: GibbsKernel, mu: Tensor, nu: Tensor, settings: Setti
     """Potentials of balanced transport between two sets."""
     tiles, log_mu, log_nu = kernel.tiles, mu.log2(), nu.log2()
     scales = settings.scales or (1.0,) * settings.n_iters
-    alpha, beta, relaxation = log_mu, log_nu, Relaxation()
+    alpha, beta, relaxation, omega = log_mu, log_nu, Relaxation(), 1.0
     sums = tiles.log_sum_columns(alpha, scales[0])
     for t, scale in enumerate(scales):
         exact, settled, last = log_nu - sums, t > 0 and scale == scales[t - 1] == 1.0, t + 1 == len(scales)
-        omega = 1.0
+        before, omega = omega, 1.0
         if settled and settings.tol is not None:
             error = _violation(beta, exact, nu)
-            omega = relaxation(error)
-            last |= not settings.tol <= error < math.inf
+            met = not settings.tol <= error < math.inf
+            # After a relaxed step the rows are not exact, so a plain one has to confirm that the columns are.
+            last |= met and before == 1.0
+            omega = 1.0 if met else relaxation(error)
         beta = exact if last else torch.lerp(beta, exact, omega)
         if last:
             break
@@ -72,7 +79,9 @@ class Relaxation:
     """Omega from the violations of successive iterations.
 
     Iterations of rate q under omega would have the rate ``(q + omega - 1)² / (q omega²)`` without, and that is best
-    served by ``2 / (1 + sqrt(1 - rate))``. Near the fixed point only: where the violation has grown tenfold, back to 1.
+    served by ``2 / (1 + sqrt(1 - rate))``. That holds for q above ``omega - 1``, which is the rate of all larger omega:
+    where it is seen, omega comes down. It grows by steps, since far from the fixed point rates say little, and goes
+    back to 1 where the violation has grown tenfold.
     """
 
     def __init__(self) -> None:
@@ -81,16 +90,29 @@ class Relaxation:
     def __call__(self, error: float) -> float:
         """Omega of the coming iteration."""
         self._seen.append(error)
-        if len(self._seen) <= _WINDOW:
+        passed = len(self._seen) - 1
+        if passed < max(_WINDOW, _LONGER / (2 - self.omega)):
             return self.omega
-        rate = (error / self._seen[0]) ** (1 / _WINDOW) if self._seen[0] > 0 else 1.0
-        if error > 10 * self._least:
+        rate = (error / self._seen[0]) ** (1 / passed) if self._seen[0] > 0 else 1.0
+        if not error <= 10 * self._least:
             self.omega = 1.0
-        elif 0 < rate < 1:
-            plain = min((rate + self.omega - 1) ** 2 / (rate * self.omega**2), _SLOWEST)
-            self.omega = max(self.omega, 2 / (1 + math.sqrt(1 - plain)))
+        elif 1 > rate > self.omega - 1 + _MARGIN * (2 - self.omega):
+            plain = (rate + self.omega - 1) ** 2 / (rate * self.omega**2)
+            self.omega = _best(max(1 - plain, (1 - _plain(self.omega)) / _GROWTH, 1 - _SLOWEST))
+        else:
+            self.omega = 1 + _FALL * (self.omega - 1)
         self._seen, self._least = [error], min(self._least, error)
         return self.omega
+
+
+def _best(gap: float) -> float:
+    """Omega for iterations whose rate is 1 - ``gap``."""
+    return 2 / (1 + math.sqrt(gap))
+
+
+def _plain(omega: float) -> float:
+    """The rate that ``omega`` is best for."""
+    return 1 - (2 / omega - 1) ** 2
 
 
 def _violation(potential: Tensor, exact: Tensor, weights: Tensor) -> float:
