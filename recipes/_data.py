@@ -27,8 +27,10 @@ from meshkit.data import (
     load_shipped,
     load_smal,
     load_smpl,
+    sample_bone_factors,
     sample_identities,
     sample_poses,
+    scale_bones,
     scan_faust,
     scan_mgn,
     scan_pose_transfer,
@@ -63,7 +65,7 @@ def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -
             return files(cfg, run, SCANNERS[kind](place))
         body, split = rigged(kind, Path(place)) if place else load_shipped(kind, cfg.vertices)
         if cfg.sampled_identities:
-            body, split = with_sampled_identities(body, split, cfg.sampled_identities, cfg.seed)
+            body, split = with_sampled_identities(body, split, cfg.sampled_identities, cfg.seed, cfg.bone_spread)
         if cfg.sampled_poses:
             body, split = with_sampled_poses(body, split, cfg.sampled_poses, cfg.seed)
     except ValueError as error:
@@ -116,11 +118,29 @@ def rigged(kind: str, file: Path) -> tuple[RiggedModel, Split]:
     return body, drawn_split(len(body.identities), len(poses), draw)
 
 
-def with_sampled_identities(body: RiggedModel, split: Split, count: int, seed: int) -> tuple[RiggedModel, Split]:
-    """A body and split with ``count`` more training identities, like the known training ones."""
-    return with_more(
+def with_sampled_identities(
+    body: RiggedModel, split: Split, count: int, seed: int, bone_spread: float = 0.0
+) -> tuple[RiggedModel, Split]:
+    """A body and split with ``count`` more training identities, like the known training ones.
+
+    With ``bone_spread`` their limbs are stretched at random (:func:`meshkit.data.scale_bones`): each becomes a shape
+    direction of its own, as it is no mixture of the known ones any more.
+    """
+    first = None if body.identities is None else len(body.identities)
+    body, split = with_more(
         body, split, "identity", seed, lambda known, draw: sample_identities(known, count, spread=0.7, generator=draw)
     )
+    if not bone_spread:
+        return body, split
+    assert body.identities is not None
+    draw = torch.Generator().manual_seed(seed)
+    factors = sample_bone_factors(body.joints, body.parents, count, spread=bone_spread, generator=draw)
+    verts, joints = scale_bones(*body.shape(body.identities[first:]), body.weights, body.parents, factors)
+    known, added = body.identities[:first], torch.eye(count)
+    body.identities = torch.block_diag(known, added)
+    body.shape_dirs = torch.cat([body.shape_dirs, verts - body.template])
+    body.joint_dirs = torch.cat([body.joint_dirs, joints - body.joints])
+    return body, split
 
 
 def with_sampled_poses(body: RiggedModel, split: Split, count: int, seed: int) -> tuple[RiggedModel, Split]:

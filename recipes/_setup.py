@@ -41,6 +41,10 @@ def check(cfg: Any) -> None:
     for name in ("sampled_identities", "sampled_poses", "workers", "threads", "warmup"):
         if getattr(cfg, name, 0) < 0:
             raise UserError(f"--{name.replace('_', '-')} must not be negative, got {getattr(cfg, name)}")
+    if not 0 <= getattr(cfg, "bone_spread", 0.0) < 1:
+        raise UserError(f"--bone-spread must lie between 0 and 1, got {cfg.bone_spread}")
+    if getattr(cfg, "bone_spread", 0.0) and not cfg.sampled_identities:
+        raise UserError("--bone-spread stretches sampled identities: give --sampled-identities too")
     if not cfg.name.strip():
         raise UserError("--name must not be empty: it is the run's folder below --out")
     if not 0 <= cfg.seed < 2**63:

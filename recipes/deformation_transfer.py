@@ -101,6 +101,7 @@ def main() -> None:
         ground_truth=True,
         pool=0,
         sampled_identities=0,
+        bone_spread=0.0,
         sampled_poses=0,
     )
     _, pairs = data(settings, run, workers=1)

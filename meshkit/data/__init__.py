@@ -26,7 +26,7 @@ from meshkit.data.pairs import PosePairs
 from meshkit.data.pool import MeshPool
 from meshkit.data.rigged import RiggedModel, rotation_matrices
 from meshkit.data.sampler import PairSampler, pair_loader
-from meshkit.data.sampling import sample_identities, sample_poses
+from meshkit.data.sampling import sample_bone_factors, sample_identities, sample_poses, scale_bones
 from meshkit.data.store import MeshStore
 
 __all__ = [
@@ -54,8 +54,10 @@ __all__ = [
     "pair_loader",
     "read_test_list",
     "rotation_matrices",
+    "sample_bone_factors",
     "sample_identities",
     "sample_poses",
+    "scale_bones",
     "scan_faust",
     "scan_mgn",
     "scan_pose_transfer",
