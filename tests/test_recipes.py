@@ -17,7 +17,15 @@ import pytest
 import torch
 from recipe_runs import ROOT, read_json, read_log, recipe_module
 
-from meshkit.data import PairBatch, PosePairs, human_split, load_humans, load_shipped
+from meshkit.data import (
+    PairBatch,
+    PosePairs,
+    human_split,
+    load_humans,
+    load_shipped,
+    sample_bone_factors,
+    scale_bones,
+)
 from meshkit.io import save_mesh
 from meshkit.models import GeneratorConfig, load_generator
 from meshkit.norm import SPAdaIN
@@ -261,6 +269,35 @@ def test_sampled_identities_join_the_training_ones_alone(run: Any, without_repor
     assert bool((body.identities[wider.train_identities][:, split.test_identities].abs() < 1e-6).all())
     again = data.with_sampled_identities(load_shipped("animals")[0], split, 50, seed=0)[0]
     assert torch.equal(again.identities, body.identities)
+
+
+def test_limbs_of_sampled_identities_are_stretched(run: Any, without_report: None) -> None:
+    more = ("--data", "animals", "--sampled-identities", 20, "--bone-spread", 0.2, "--steps", 1, *SMALL_EXTRACTOR)
+    folder = run("corenet3d", *more, *WITHOUT_DESCRIPTORS)
+    assert read_json(folder / "config.json")["bone_spread"] == 0.2
+    data = recipe_module("_data")
+    known, split = load_shipped("animals")
+    plain, _ = data.with_sampled_identities(load_shipped("animals")[0], split, 20, seed=0)
+    body, wider = data.with_sampled_identities(load_shipped("animals")[0], split, 20, seed=0, bone_spread=0.2)
+    old = torch.cat([split.train_identities, split.test_identities])
+    pose = torch.zeros_like(old)
+    assert torch.allclose(body(old, pose), known(old, pose), atol=1e-6)
+    new = wider.train_identities[-20:]
+    (rest, joints), (before, joints_before) = body.shape(new), plain.shape(new)
+    factors = sample_bone_factors(
+        known.joints, known.parents, 20, spread=0.2, generator=torch.Generator().manual_seed(0)
+    )
+    expected = scale_bones(before, joints_before, known.weights, known.parents, factors)
+    assert torch.allclose(rest, expected[0], atol=1e-6) and torch.allclose(joints, expected[1], atol=1e-6)
+    assert (rest - before).norm(dim=2).mean() > 0.02
+
+
+def test_stretched_limbs_need_sampled_identities(run: Any) -> None:
+    error = recipe_module("_run").UserError
+    with pytest.raises(error, match="--bone-spread stretches sampled identities: give --sampled-identities too"):
+        run("corenet3d", "--bone-spread", 0.2, "--steps", 1)
+    with pytest.raises(error, match=r"--bone-spread must lie between 0 and 1, got -0\.1"):
+        run("corenet3d", "--bone-spread", -0.1, "--sampled-identities", 4, "--steps", 1)
 
 
 def test_sampled_poses_join_the_training_ones_alone(run: Any, without_report: None) -> None:
