@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from meshkit._repr import settings
-from meshkit.losses._common import Reduction, check_reduction, reduce_samples
+from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
 
 __all__ = ["MatchingLoss", "matching_loss"]
 
@@ -63,6 +63,7 @@ def matching_loss(plan: Tensor | _Readable, correspondence: Tensor, *, reduction
         )
     known = correspondence >= 0
     if isinstance(plan, Tensor):
+        plan = at_least_float32(plan)
         masses, at = plan.sum(2), plan.gather(2, correspondence.clamp_min(0).long()[..., None])[..., 0].log()
     else:
         masses, at = plan.row_sums(), plan.log_at(correspondence)
