@@ -17,7 +17,7 @@ from typing import Literal
 import torch
 from _apply import apply
 from _data import inputs
-from _run import guard
+from _run import UserError, guard
 from _settings import Settings, parse
 from _train import train
 from torch import Tensor
@@ -94,6 +94,8 @@ def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float
         "edge": cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces),
     }
     if cfg.lambda_match:
+        if not bool((batch.correspondence >= 0).any()):
+            raise UserError(f"--lambda-match needs true matches, which --data {cfg.data} does not know: drop it")
         losses["match"] = cfg.lambda_match * matching_loss(result.plan, batch.correspondence)
     return losses
 

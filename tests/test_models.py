@@ -449,6 +449,8 @@ def test_released_matching_reads_like_a_plan():
         lambda p: p.barycentric(values),
         lambda p: p.row_sums(),
         lambda p: p.marginals()[1],
+        lambda p: p.log_at(torch.arange(12).expand(2, -1)),
+        lambda p: p.log_at(torch.full((2, 12), -1)).exp(),
     ):
         assert_near(read(plan), read(expected), 1e-5)
     assert torch.equal(plan.argmax(), expected.argmax()) and torch.equal(plan.argmax(1), expected.argmax(1))

@@ -96,6 +96,22 @@ def test_corenet3d_compares_with_the_truth(batch: PairBatch) -> None:
     assert float(losses["edge"]) == pytest.approx(cfg.lambda_edge * penalty, rel=1e-4)
 
 
+def test_corenet3d_may_be_told_the_matches(batch: PairBatch) -> None:
+    recipe = recipe_module("corenet3d")
+    cfg = replace(small(recipe), lambda_match=3.0)
+    torch.manual_seed(0)
+    generator, system = recipe.build(cfg)
+    losses = recipe.step(system, batch, cfg, 0.0)
+    plan = generator(batch.identity, batch.pose).plan.dense().detach()
+    shares = plan.gather(2, batch.correspondence[..., None])[..., 0] / plan.sum(2)
+    assert float(losses["match"].detach()) == pytest.approx(-3 * float(shares.log().mean()), rel=1e-4)
+    losses["match"].backward()
+    assert any(p.grad is not None and bool((p.grad != 0).any()) for p in generator.extractor.parameters())
+    unknown = replace(batch, correspondence=torch.full_like(batch.correspondence, -1))
+    with pytest.raises(recipe_module("_run").UserError, match="--lambda-match needs true matches, which --data humans"):
+        recipe.step(system, unknown, cfg, 0.0)
+
+
 def test_corenet3d_for_a_time_without_descriptors(run: Any) -> None:
     folder = run("corenet3d", "--minutes", 0.02, *WITHOUT_DESCRIPTORS, *SMALL_EXTRACTOR, "--model.widths", 16, 8)
     steps = read_json(folder / "config.json")["steps"]
