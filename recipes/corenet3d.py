@@ -34,7 +34,7 @@ class Config(Settings):
     name: str = "corenet3d"
     """Name of the run."""
     lambda_rec: float = 1000.0
-    """Weight of the reconstruction. Released code: 1000."""
+    """Weight of the reconstruction. Released code: 1000. With 0 for it and the edge loss, the matching alone learns."""
     lambda_edge: float = 0.5
     """Weight of the edge loss (length ratios). Released code: 0.5."""
     lambda_match: float = 0.0
@@ -89,10 +89,11 @@ def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float
     """The weighted losses of one step."""
     result = system(batch.identity, batch.pose, **inputs(batch))
     output = result.vertices
-    losses = {
-        "rec": cfg.lambda_rec * reconstruction_loss(output, batch.ground_truth, mask=batch.identity_mask),
-        "edge": cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces),
-    }
+    losses = {}
+    if cfg.lambda_rec:
+        losses["rec"] = cfg.lambda_rec * reconstruction_loss(output, batch.ground_truth, mask=batch.identity_mask)
+    if cfg.lambda_edge:
+        losses["edge"] = cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces)
     if cfg.lambda_match:
         if not bool((batch.correspondence >= 0).any()):
             raise UserError(f"--lambda-match needs true matches, which --data {cfg.data} does not know: drop it")
