@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 import meshkit._transfer_command as front
 import meshkit.transfer._choose as choose
+from meshkit._names import did_you_mean, nearest
 from meshkit._transfer_command import main, parser
 from meshkit.batching import center
 from meshkit.data import load_animals, load_humans, load_shipped
@@ -1032,6 +1033,8 @@ def test_mistakes_are_found_before_pytorch_is_imported(tmp_path):
     for words in (["none.obj", "x.obj"], [tmp_path, tmp_path, "--refine", "-1"], ["a", "b", "--frame", "c"]):
         done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True)
         assert done.returncode == 2 and done.stderr.startswith("error: "), done.stderr
+    done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
+    assert done.returncode == 0 and all(name in done.stdout for name in pretrained_names()), done.stdout
 
 
 def test_the_commands_units_are_those_of_the_package():
@@ -1067,6 +1070,38 @@ def test_an_axis_with_a_minus_may_stand_alone():
     assert (args.pose_facing, args.identity_up, args.pose_up) == ("-y", "-z", "+x")
     with pytest.raises(SystemExit):
         parser().parse_args([*words, "-y"])
+    args = parser().parse_args(["a.obj", "b.obj", "--pose-faci", "-y", "--identity-up", "-z", "-o", "c.obj"])
+    assert (args.pose_facing, args.identity_up, args.out) == ("-y", "-z", Path("c.obj"))
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("--pose-up y", "argument --pose-up: takes +x, -x, +y, -y, +z or -z, got 'y': did you mean +y?"),
+        ("--pose-up -Y", "argument --pose-up: takes +x, -x, +y, -y, +z or -z, got '-Y': did you mean -y?"),
+        ("--pose-up up", "argument --pose-up: takes +x, -x, +y, -y, +z or -z, got 'up'"),
+        ("--pose-facing -o b.obj", "argument --pose-facing: expected one argument"),
+        ("--pose -y", "ambiguous option: --pose could match --pose-up, --pose-facing, --pose-unit"),
+        (
+            "--identity-unit centimetre",
+            "argument --identity-unit: takes m, cm, mm, in or ft, got 'centimetre': did you mean cm?",
+        ),
+        ("--pose-unit Inch", "argument --pose-unit: takes m, cm, mm, in or ft, got 'Inch': did you mean in?"),
+        ("--frame identiy", "argument --frame: takes pose or identity, got 'identiy': did you mean identity?"),
+    ],
+)
+def test_a_wrong_choice_is_told_with_the_nearest_and_all(line, said, capsys):
+    with pytest.raises(SystemExit) as caught:
+        parser().parse_args(["a.obj", "b.obj", *line.split()])
+    assert caught.value.code == 2
+    assert capsys.readouterr().err == f"error: {said}; --help lists the options\n"
+
+
+def test_the_nearest_name_is_the_first_of_equals():
+    assert nearest("y", ["+y", "-y"]) == "+y" and nearest("y", ["-y", "+y"]) == "-y"
+    assert nearest("XDUALNET_human", ["xdualnet-animals", "xdualnet-humans"]) == "xdualnet-humans"
+    assert nearest("zebra", ["+y", "humans"]) is None and nearest("a", []) is None
+    assert did_you_mean("zebra", ["humans"]) == "" and did_you_mean("human", ["humans"]) == ": did you mean humans?"
 
 
 def test_reports_say_how_good_the_weights_are(person, mover):
