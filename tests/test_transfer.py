@@ -298,7 +298,11 @@ def test_the_report_says_what_was_done(person, mover):
     assert "UNUSUAL  the network changes the identity's edges much in length: 0.0%" in text
     assert result.report.confidence.edge_change == pytest.approx(0, abs=1e-5)
     assert result.report.confidence.identity_distance is None
-    assert "do not say what is usual" in str(transfer_pose(person, mover, weights=copier(), **UPRIGHT).report)
+    unjudged = transfer_pose(person, mover, weights=copier(), **UPRIGHT).report
+    doubted = replace(unjudged, doubts=(Doubt("pose", "odd"),))
+    assert "UNUSUAL  " in str(doubted) and "UNUSUAL  " not in str(unjudged)
+    assert all("do not say what is usual" in str(report) for report in (unjudged, doubted))
+    assert "what is usual" not in str(replace(doubted, calibrated=True))
     assert "all within what is usual" in str(transfer_pose(person, mover, weights=copier(usual=WIDE), **UPRIGHT).report)
 
 
