@@ -51,7 +51,7 @@ from meshkit.transfer import (
 from meshkit.transfer._frames import axis_name, axis_vector, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import Likeness, guess_kind
 from meshkit.transfer._open import named, open_mesh
-from meshkit.transfer._openings import find_openings, opening_lengths
+from meshkit.transfer._openings import boundary_loops, find_openings
 from meshkit.transfer._orient import RestBody
 from meshkit.transfer._units import UNITS, find_scale, scale_to
 from meshkit.transfer.confidence import roughness, row_entropies
@@ -1231,13 +1231,51 @@ def test_openings_are_measured():
     lids = np.abs(ring.face_normals[:, 2]) > 0.5
     tube = torch.tensor(ring.vertices).float(), torch.tensor(ring.faces[~lids])
     around = 64 * 2 * math.sin(math.pi / 64)
-    assert_near(opening_lengths(*tube), torch.tensor([around, around]).double(), 1e-5)
+    loops, area = boundary_loops(*tube), 64 * math.sin(math.tau / 64) / 2
+    assert_near(loops.length, torch.tensor([around, around]).double(), 1e-5)
+    assert_near(loops.width, torch.tensor([area, area]).mul(4 * math.pi).sqrt().double(), 1e-5)
+    assert_near(loops.facing, torch.zeros(2).double(), 1e-5)
     found = find_openings(*tube)
     assert found.loops == 2 and found.longest == pytest.approx(around / math.sqrt(2 * around), rel=1e-5)
-    assert "2 boundary loops, the longest 1.77 times" in found.doubt
+    assert found.cut == pytest.approx(float(loops.width[0]) / math.sqrt(2 * around), rel=1e-5)
+    assert "2 boundary loops, one as wide as a cut, 1.77 times" in found.doubt
     assert find_openings(10 * tube[0], tube[1]).longest == pytest.approx(found.longest, rel=1e-5)
     closed = find_openings(torch.tensor(ring.vertices), torch.tensor(ring.faces))
-    assert closed == (0, 0.0) and closed.doubt == ""
+    assert closed == (0, 0.0, 0.0) and closed.doubt == ""
+
+
+def sheet(count: int) -> Mesh:
+    """A square of (count - 1) ** 2 squares."""
+    grid = torch.arange(count * count).reshape(count, count)
+    a, b, c, d = (t.flatten() for t in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]))
+    verts = torch.stack([grid // count, grid % count, 0 * grid], 2).reshape(-1, 3).float()
+    return verts, torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])
+
+
+def test_a_hole_and_a_sheet_face_otherwise_than_a_cut():
+    verts, faces = sheet(13)
+    assert_near(boundary_loops(verts, faces).facing, -torch.ones(1).double(), 1e-6)
+    inside = (verts[faces][..., :2].mean(1) - 6).abs().amax(1) < 1  # four squares in the middle
+    for turned in (faces, faces.flip(1)):
+        loops = boundary_loops(verts, turned[~inside])
+        assert_near(loops.facing, torch.tensor([-1.0, 1.0]).double(), 1e-6)
+        assert_near(loops.length, torch.tensor([48.0, 8.0]).double(), 1e-6)
+        assert_near(loops.width, torch.tensor([144.0, 4.0]).mul(4 * math.pi).sqrt().double(), 1e-5)
+    # A jagged edge is longer, and no wider: the corner of every other square of the rim is gone.
+    jagged = torch.cat([faces[:144], faces[144:][verts[faces[144:]][..., 1].amax(1) < 12], faces[-1:]])
+    smooth, rough = boundary_loops(verts, faces), boundary_loops(verts, jagged)
+    assert rough.length[0] > 1.05 * smooth.length[0] and rough.width[0] < smooth.width[0]
+
+
+@pytest.mark.parametrize(("radius", "told"), [(0.02, False), (0.1, True)])
+def test_a_hole_in_the_back_is_no_cut_until_it_is_wide(radius, told):
+    body = load_humans(6890)
+    verts = body.template
+    back = torch.tensor([0.0, verts[:, 1].max(), float(verts[:, 2].quantile(0.8))])
+    middle = verts[((verts - back) ** 2).sum(1).argmin()]
+    gone = (verts - middle).norm(dim=1) < radius
+    found = find_openings(verts, body.faces[~gone[body.faces].any(1)])
+    assert found.loops == 1 and found.longest > 0.1 and bool(found.cut) == told
 
 
 def test_a_wrong_unit_changes_neither_kind_nor_roughness_nor_openings(person):
@@ -1261,7 +1299,7 @@ def test_what_is_cut_off_is_noticed(kind, joint):
     for who in (0, 1):
         assert "give the whole body" in find_openings(*without(kind, joint, who)).doubt
     body = load_shipped(kind)[0]
-    assert find_openings(body.template, body.faces) == (0, 0.0)
+    assert find_openings(body.template, body.faces) == (0, 0.0, 0.0)
 
 
 def test_an_open_mesh_is_in_doubt(mover):
@@ -1269,7 +1307,7 @@ def test_an_open_mesh_is_in_doubt(mover):
     verts, faces = without("humans", 71)
     report = transfer_pose((verts, faces), mover, weights=copier(data="humans", usual=WIDE), **UPRIGHT).report
     (said,) = [text for text in report.warnings if "open" in text]
-    assert said.startswith("the identity mesh is open: 1 boundary loop, the longest 0.3")
+    assert said.startswith("the identity mesh is open: 1 boundary loop, one as wide as a cut, 0.")
     assert report.as_dict()["identity"]["openings"]["loops"] == 1
     body = load_humans()
     net = copier(data="humans", usual=WIDE)
