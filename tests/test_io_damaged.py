@@ -190,6 +190,7 @@ def test_a_solid_may_have_any_name(tmp_path: Path) -> None:
         ("m.ply", TEXT.replace("uchar int", "uchar float"), "no list of integers vertex_indices or vertex_index"),
         ("m.ply", TEXT + ROWS.replace("1 0 0", "1 0"), "line 11, '1 0': a vertex is three numbers; mend that line, or"),
         ("m.ply", TEXT + ROWS.replace("1 0 0", "1 b 0"), "line 11, '1 b 0': a vertex is three numbers; mend that line"),
+        ("m.ply", TEXT + ROWS.replace("1 0 0", "7 1 0 0"), "line 11, .*names 3 numbers of a vertex, here are 4; mend"),
         ("m.ply", TEXT + "0 0 0\n", "the file ends too early: 1 of 3 vertices are there; copy or export it again"),
         ("m.ply", TEXT + ROWS[:-8], "the file ends too early: 0 of 1 faces are there; copy or export it again"),
         ("m.ply", TEXT + ROWS.replace("3 0 1 2", "2 0 1"), f"line 13, '2 0 1': {A_FACE}; mend that line, or export"),

@@ -29,13 +29,22 @@ def read_text(lines: Iterable[Row], claims: dict[str, int], types: Types, name: 
             columns = tuple(map(order.index, "xyz"))
             if any(kind.startswith("list") for kind in kinds[: max(columns)]):
                 raise ValueError("its vertices have a list before x, y or z; export it without")
-            read_rows(rows, count, "vertices", partial(add_verts, mesh=mesh, columns=columns))
+            width = None if any(kind.startswith("list") for kind in kinds) else len(kinds)
+            read_rows(rows, count, "vertices", partial(_add_verts, mesh=mesh, columns=columns, width=width))
         elif element == "face":
             face = _Face(types[element], name)
             read_rows(rows, count, "faces", partial(face.add, mesh=mesh))
         elif types[element]:
             read_rows(rows, count, f"rows of {element!r}", lambda *_: None)
     return mesh.parsed()
+
+
+def _add_verts(rows: list[Row], ends: bool, mesh: Growing, columns: tuple[int, ...], width: int | None) -> None:
+    """Vertices, one in a line, of as many numbers as the header names, if that is known."""
+    add_verts(rows, ends, mesh, columns)
+    for number, line in rows:
+        if width is not None and (there := len(line.split())) != width:
+            raise blame(number, line, f"the header names {width} numbers of a vertex, here are {there}")
 
 
 class _Face(NamedTuple):
