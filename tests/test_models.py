@@ -675,8 +675,9 @@ def test_spectral_normalisation_sits_on_the_blocks_alone(spectral):
 # Errors of the forward pass
 
 
-@pytest.mark.parametrize("option", [{"n_iters": 1.5}, {"k": 4.5}])
+@pytest.mark.parametrize("option", [{"n_iters": 1.5}, {"k": 4.5}, {"n_iters": 5.0}, {"k": 8.0}])
 def test_counts_are_whole_numbers(option):
+    """Also those that the functions called in the forward pass would refuse."""
     with pytest.raises(ValueError, match="n_iters and k must be whole numbers, got"):
         make(**option)
 

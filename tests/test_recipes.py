@@ -18,6 +18,7 @@ import torch
 from recipe_runs import ROOT, read_json, read_log, recipe_module
 
 from meshkit.data import (
+    MeshPool,
     PairBatch,
     PosePairs,
     human_split,
@@ -481,6 +482,28 @@ def test_init_begins_with_the_weights_of_a_run(run: Callable[..., Path], without
     with pytest.raises(recipe_module("_run").UserError, match=said):
         run(*other)
     assert not (tmp_path / "third").exists(), "refused before anything is computed"
+
+
+def test_no_steps_report_what_the_weights_are_worth(run: Callable[..., Path]) -> None:
+    known = run("npt", "--steps", 2, "--model.extractor-widths", 4, 4, 5)
+    run("npt", "--name", "again", "--steps", 0, "--init", known, "--seed", 1, "--model.extractor-widths", 4, 4, 5)
+    first, second = (read_json(known.parent / name / "summary.json") for name in ("run", "again"))
+    assert second["test"] == first["test"] and second["test"]["pmd"] > 0
+    assert (second["init"], second["steps"], second["pairs_seen"]) == (str(known), 0, 0) and first["init"] is None
+    assert (known.parent / "again" / "sheet.png").exists() and not (known.parent / "again" / "state.pt").exists()
+    with pytest.raises(recipe_module("_run").UserError, match="--steps 0 evaluates weights without training: say"):
+        run("npt", "--name", "third", "--steps", 0)
+
+
+def test_no_steps_make_no_more_of_the_training_pool_than_a_pair(
+    run: Callable[..., Path], without_report: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = run("corenet3d", "--steps", 1, *SMALL_EXTRACTOR, "--model.widths", 8, 8)
+    counts, build = [], MeshPool.build
+    monkeypatch.setattr(MeshPool, "build", lambda *a, **options: counts.append(a[3]) or build(*a, **options))
+    size = ("--pool", 50, *SMALL_EXTRACTOR, "--model.widths", 8, 8)
+    run("corenet3d", "--name", "again", "--steps", 0, "--init", known, *size)
+    assert counts == [2]
 
 
 @pytest.mark.parametrize(
