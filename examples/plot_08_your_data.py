@@ -191,7 +191,7 @@ pictures = [
     render(v, f, colors=rim(v, f), bounds=box, size=(300, 380), elevation=25, shading="flat", supersample=3)
     for v, f in ((broken, broken_faces), (clean.verts, clean.faces))
 ]
-captions = [f"{len(v)} vertices, holes: {r.boundary_loops}" for v, r in ((broken, before), (clean.verts, after))]
+captions = [f"{len(v)} vertices, holes: {r.holes}" for v, r in ((broken, before), (clean.verts, after))]
 show(contact_sheet([pictures], column_titles=["as it came", "clean"], captions=[captions]))
 
 # %%
