@@ -10,7 +10,7 @@ from meshkit.losses.chamfer import ChamferLoss, chamfer_loss
 from meshkit.losses.edge_length import EdgeLengthLoss, edge_length_loss
 from meshkit.losses.edge_ratio import EdgeRatioLoss, edge_ratio_loss
 from meshkit.losses.laplacian import LaplacianLoss, laplacian_loss
-from meshkit.losses.matching import MatchingLoss, matching_loss
+from meshkit.losses.matching import MatchingLoss, RowPlanLike, matching_loss
 from meshkit.losses.normal_consistency import NormalConsistencyLoss, normal_consistency_loss
 from meshkit.losses.per_sample import ARAPEnergyLoss, SinkhornDivergenceLoss
 from meshkit.losses.reconstruction import ReconstructionLoss, reconstruction_loss
@@ -27,6 +27,7 @@ __all__ = [
     "NormalConsistencyLoss",
     "PlanLike",
     "ReconstructionLoss",
+    "RowPlanLike",
     "SinkhornDivergenceLoss",
     "arap_energy",
     "backward_correspondence_loss",

@@ -8,19 +8,24 @@ from torch import Tensor, nn
 from meshkit._repr import settings
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
 
-__all__ = ["MatchingLoss", "matching_loss"]
+__all__ = ["MatchingLoss", "RowPlanLike", "matching_loss"]
 
 
-class _Readable(Protocol):
+class RowPlanLike(Protocol):
+    """What the loss asks of a batch of transport plans T, which need not be stored."""
+
     @property
-    def shape(self) -> torch.Size: ...
+    def shape(self) -> torch.Size:
+        """``(B, N, M)``."""
 
-    def log_at(self, columns: Tensor, /) -> Tensor: ...
+    def log_at(self, columns: Tensor, /) -> Tensor:
+        """Return the logarithm of one entry of each row, ``(B, N)``; -inf at negative columns."""
 
-    def row_sums(self) -> Tensor: ...
+    def row_sums(self) -> Tensor:
+        """Return T 1, ``(B, N)``."""
 
 
-def matching_loss(plan: Tensor | _Readable, correspondence: Tensor, *, reduction: Reduction = "mean") -> Tensor:
+def matching_loss(plan: Tensor | RowPlanLike, correspondence: Tensor, *, reduction: Reduction = "mean") -> Tensor:
     r"""Negative log-likelihood of known matches: each row of the plan is a distribution over the columns.
 
     .. math:: \frac1B \sum_b \frac{1}{|K_b|} \sum_{i \in K_b} -\log \frac{T_{i, c(i)}}{\sum_j T_{ij}}
@@ -95,6 +100,6 @@ class MatchingLoss(nn.Module):
         """Options in the printed module."""
         return settings(self, "reduction")
 
-    def forward(self, plan: Tensor | _Readable, correspondence: Tensor) -> Tensor:
+    def forward(self, plan: Tensor | RowPlanLike, correspondence: Tensor) -> Tensor:
         """Return the loss, see :func:`matching_loss`."""
         return matching_loss(plan, correspondence, reduction=self.reduction)
