@@ -1,0 +1,210 @@
+"""The energy of one mesh on the CPU, and its minimisation by L-BFGS."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from meshkit.deform.factor import ARAPFactor
+from meshkit.deform.objective import Objective
+from meshkit.deform.options import ARAPInfo
+from meshkit.deform.rotation import ClosestRotation, RotationDifferential
+from meshkit.deform.sparse import csr_of_scipy, linear
+from meshkit.deform.tracker import RotationTracker
+
+__all__ = ["MeshObjective", "minimise"]
+
+# Of L-BFGS, for one mesh as for a batch.
+MEMORY, HALVINGS, SUFFICIENT = 5, 8, 2e-4
+LONGEST = 4.0  # times the step of local-global
+
+
+class MeshObjective(Objective):
+    """Energy of one mesh; its evaluations take rotations of `dtype`, which Newton's method finds from the last ones.
+
+    Matrices of cells are stored transposed and component first, (column, row, cell), the order in which the products
+    come.
+    """
+
+    look = 1
+
+    def __init__(
+        self, factor: ARAPFactor, soft_targets: Tensor | None, *, dtype: torch.dtype, compiled: bool = False
+    ) -> None:
+        self.factor, self.dtype = factor, dtype
+        rest, size = factor.rest, factor.rest.topology.num_verts
+        self.tracker = RotationTracker(compiled=compiled)
+        self.evaluations = 0
+        # Rotations ignore scale: bring the matrices near 1, where float32 has room.
+        cells = rest.topology.num_cells
+        self.scale = rest.rest_energy / rest.topology.multiplicity / max(cells, 1) or 1.0
+        # On the CPU torch's products with three columns are twice as fast as scipy's.
+        self.moments, self.moments_t = csr_of_scipy(rest.moments, 1 / self.scale), csr_of_scipy(rest.moments_t)
+        count = len(factor.free)
+        self._place = torch.full((size,), count, dtype=torch.int32, device="cpu")
+        self._place[factor.free] = torch.arange(count, dtype=torch.int32, device="cpu")
+        # One flag per coordinate: a mask that broadcasts costs three times as much on the CPU.
+        self.free = (self._place < count)[:, None].repeat(1, 3)
+        soft = None if factor.soft is None else factor.soft[:, None]
+        super().__init__(rest.verts, rest.edges, csr_of_scipy(factor.stiffness), soft, soft_targets)
+
+    @property
+    def floor(self) -> float:  # type: ignore[override]
+        """See :class:`Objective`: float32 rotations do not resolve less."""
+        return 1e-6 if self.dtype == torch.float32 else 1e-10
+
+    def start_from_rest(self) -> None:
+        """Let the tracked rotations start from the identity."""
+        self.tracker.start(self.factor.rest.topology.num_cells, self.dtype)
+
+    def refine(self) -> None:
+        """Go over to float64 rotations."""
+        self.dtype, self.tracker.slack = torch.float64, 1e-4
+
+    def identity(self) -> Tensor:
+        """The identity as the rotation of every cell."""
+        eye = torch.eye(3, dtype=torch.float64, device="cpu")
+        return eye[:, :, None].expand(3, 3, self.factor.rest.topology.num_cells)
+
+    def matrices(self, x: Tensor, dtype: torch.dtype) -> Tensor:
+        """S of every cell over `scale`, or its change if x is one; differentiable."""
+        stacked = linear(x, self.moments.matmul, lambda S: self.moments_t @ S / self.scale)
+        return stacked.to(dtype).view(-1, 9).t().contiguous().view(3, 3, -1)
+
+    def pulled_back(self, rotations: Tensor) -> Tensor:
+        """B^T R (V, 3); differentiable."""
+        stacked = rotations.reshape(9, -1).t().contiguous().double().view(-1, 3)
+        return linear(stacked, self.moments_t.matmul, lambda x: self.moments @ x * self.scale)
+
+    def rotations(self, x: Tensor, guess: Any) -> tuple[Tensor, Any]:
+        """Best rotations, and their quaternions as the next guess."""
+        rotations, quaternions = ClosestRotation.apply(self.matrices(x, self.dtype), guess)
+        return rotations, quaternions
+
+    def ended(self, x: Tensor, iterations: Tensor, tol: float) -> ARAPInfo:
+        """The report on iterations that ended at x, by float64 rotations."""
+        self.tracker.last = None
+        self.refine()
+        return super().ended(x, iterations, tol)
+
+    def tracked_rotations(self, x: Tensor) -> Tensor:
+        """Best rotations for an x near that of the last call."""
+        self.evaluations += 1
+        return self.tracker(self.matrices(x, self.dtype))
+
+    def linearise(self, x: Tensor, *, precise: bool) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Best rotations at x, and the map D[B p] from a direction p (V, 3) to their change."""
+        dtype = torch.float64 if precise else torch.float32
+        S = self.matrices(x, torch.float64)
+        last = self.tracker.last
+        R = ClosestRotation.apply(S, None if last is None else last[0].double())[0].to(dtype)
+        differential = RotationDifferential(S.to(dtype), R)
+        return R, lambda direction: differential(self.matrices(direction, dtype))
+
+    def component_first(self, rotations: Tensor) -> Tensor:
+        """Rotations as they are."""
+        return rotations
+
+    def solve(self, right: Tensor) -> Tensor:
+        """Apply the inverse of the stiffness of the free vertices; 0 at the others."""
+        solved = self.factor.solve(right.index_select(0, self.factor.free).numpy())
+        padded = torch.cat([torch.from_numpy(solved), right.new_zeros(1, 3)])
+        return padded.index_select(0, self._place)
+
+    def dot(self, a: Tensor, b: Tensor) -> Tensor:
+        """Inner product (1,) of vectors."""
+        return torch.dot(a.view(-1), b.view(-1))[None]
+
+    def spread(self, values: Tensor) -> Tensor:
+        """The value as (1, 1)."""
+        return values[:, None]
+
+
+def minimise(
+    objective: MeshObjective, x: Tensor, *, max_iter: int, tol: float, refine: bool
+) -> tuple[Tensor, ARAPInfo]:
+    """L-BFGS whose metric is the factored stiffness, so that its first step is one of local-global.
+
+    The turning of the rotations makes the energy flatter than its stiffness L says. By how much, the last step s and
+    change y of the gradient tell: the metric is L over s^T L s / s^T y, at least 1. `minimise_batch` does the same
+    without a branch on the data; here branches cost nothing, and save the masks over all vectors.
+
+    Args:
+        objective: what to minimise.
+        x: (V, 3) positions that meet the handles.
+        max_iter: evaluations at most.
+        tol: residual at which to stop.
+        refine: go over to float64 rotations once float32 ones have done what they can.
+
+    Returns:
+        Positions, and the report.
+    """
+    dot = objective.dot
+    history: list[tuple[Tensor, Tensor, Tensor]] = []
+    energy, gradient = objective(x)
+    image, stretch = objective.image, 1.0
+    slack = 1e-13 * objective.constant.abs()
+    negative = False
+    while True:
+        direction = _two_loops(objective, history, gradient, stretch)
+        decrease = dot(gradient, direction)
+        # Without a history this is g^T L^-1 g; with one it knows the curvature too, and is mostly larger.
+        residual = objective.relative(decrease, energy)
+        coarse = refine and objective.dtype == torch.float32
+        if coarse and tol < 1e-7 and residual <= 1e-7:
+            objective.refine()
+            energy, gradient = objective(x)
+            history.clear()
+            image, stretch = objective.image, 1.0
+            continue
+        if residual <= tol or objective.evaluations >= max_iter:
+            break
+        step, accepted = 1.0, False
+        for _ in range(HALVINGS):
+            candidate = torch.sub(x, direction, alpha=step)
+            new_energy, new_gradient = objective(candidate)
+            accepted = bool(new_energy <= energy - SUFFICIENT * step * decrease + slack)
+            if accepted or objective.evaluations >= max_iter:
+                break
+            step *= 0.5
+        if not accepted:
+            if history:
+                history.clear()
+            elif coarse:
+                objective.refine()
+                energy, gradient = objective(x)
+                image = objective.image
+            else:
+                break
+            stretch = 1.0
+            continue
+        move, change = direction.mul_(-step), new_gradient - gradient
+        curvature = dot(move, change)
+        negative = bool(curvature < 0)
+        if curvature > 0:
+            history = [*history[1 - MEMORY :], (move, change, 1 / curvature)]
+            stretch = float((dot(move, objective.image - image) / curvature).clamp(1.0, LONGEST))
+        else:
+            history.clear()
+            stretch = 1.0
+        x, energy, gradient, image = candidate, new_energy, new_gradient, objective.image
+    ended = residual <= tol
+    if history:
+        residual = objective.residual(energy, gradient)
+    evaluations = torch.tensor([objective.evaluations], device="cpu")
+    return x, objective.info(energy, evaluations, residual, ended, torch.tensor([negative], device="cpu"))
+
+
+def _two_loops(
+    objective: MeshObjective, history: list[tuple[Tensor, Tensor, Tensor]], gradient: Tensor, stretch: float
+) -> Tensor:
+    """The L-BFGS inverse Hessian applied to a gradient."""
+    dot, right, shares = objective.dot, gradient.clone(), []
+    for move, change, inverse in reversed(history):
+        shares.append(inverse * dot(move, right))
+        right.addcmul_(change, shares[-1], value=-1)
+    direction = objective.solve(right).mul_(stretch)
+    for (move, change, inverse), share in zip(history, reversed(shares), strict=True):
+        direction.addcmul_(move, share - inverse * dot(change, direction))
+    return direction
