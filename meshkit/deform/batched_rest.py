@@ -30,7 +30,8 @@ class BatchedRest:
 
     Attributes:
         origin: (B, 1, 3) mean of the real vertices.
-        verts: (B, V, 3) positions about it, 0 at padding.
+        verts: (BV, 3) positions about it, 0 at padding.
+        force_at_rest: (BV, 3) the Laplacian times these.
         edges: of the faces, numbered through.
         rows, cols, values: entries of the Laplacian.
         moments, moments_t: (3K, BV) sparse matrix to the columns of S, column d of cell k in row d K + k; and its
@@ -43,10 +44,11 @@ class BatchedRest:
         real = mask[..., None]
         positions = torch.where(real, verts.detach().double(), 0.0)
         self.origin = positions.sum(1, keepdim=True) / real.sum(1, keepdim=True).clamp_min(1)
-        self.verts = torch.where(real, positions - self.origin, 0.0)
+        centred = torch.where(real, positions - self.origin, 0.0)
+        self.verts = centred.flatten(0, 1)
         start = self.size * torch.arange(self.batch, device=device)[:, None, None]
         corners = (faces.clamp_min(0) + start).flatten(0, 1)
-        weights = cotangent_weights(self.verts, faces).flatten(0, 1)
+        weights = cotangent_weights(centred, faces).flatten(0, 1)
         regular = (weights != 0).any(1)
         kept = regular[:, None].expand_as(weights)
         if energy == "spokes":
@@ -66,7 +68,8 @@ class BatchedRest:
         cols = torch.cat([corners.repeat(1, 3).flatten(), own])
         self.rows, self.cols, values = _summed(rows, cols, entries[:, None], (count, count))
         self.values = values[:, 0]
-        scaled = weights[..., None] * self.edges.vectors(self.verts.flatten(0, 1)).permute(2, 1, 0) / self.multiplicity
+        self.force_at_rest = csr(self.rows, self.cols, self.values, (count, count)) @ self.verts
+        scaled = weights[..., None] * self.edges.vectors(self.verts).permute(2, 1, 0) / self.multiplicity
         places = cells.repeat_interleave(3, 1), corners.repeat(1, cells.shape[1])
         rows, cols, values = _summed(*places, templates.moment @ scaled, (self.num_cells, count))
         shift = self.num_cells * torch.arange(3, device=device)[:, None]

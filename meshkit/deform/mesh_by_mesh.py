@@ -9,7 +9,8 @@ from torch import Tensor
 
 from meshkit.deform.face_edges import EnergyOfMeshes
 from meshkit.deform.factor import ARAPFactor
-from meshkit.deform.mesh_objective import MeshObjective, minimise
+from meshkit.deform.lbfgs import minimise
+from meshkit.deform.mesh_objective import MeshObjective
 from meshkit.deform.minimum import minimum
 from meshkit.deform.options import ARAPInfo, Options
 from meshkit.deform.problem import Problem

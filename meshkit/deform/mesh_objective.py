@@ -1,4 +1,4 @@
-"""The energy of one mesh on the CPU, and its minimisation by L-BFGS."""
+"""The energy of one mesh on the CPU."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,11 +13,7 @@ from meshkit.deform.rotation import ClosestRotation, RotationDifferential
 from meshkit.deform.sparse import csr_of_scipy, linear
 from meshkit.deform.tracker import RotationTracker
 
-__all__ = ["MeshObjective", "minimise"]
-
-# Of L-BFGS, for one mesh as for a batch.
-MEMORY, HALVINGS, SUFFICIENT = 5, 8, 2e-4
-LONGEST = 4.0  # times the step of local-global
+__all__ = ["MeshObjective"]
 
 
 class MeshObjective(Objective):
@@ -47,7 +43,7 @@ class MeshObjective(Objective):
         # One flag per coordinate: a mask that broadcasts costs three times as much on the CPU.
         self.free = (self._place < count)[:, None].repeat(1, 3)
         soft = None if factor.soft is None else factor.soft[:, None]
-        super().__init__(rest.verts, rest.edges, csr_of_scipy(factor.stiffness), soft, soft_targets)
+        super().__init__(rest, csr_of_scipy(factor.stiffness), soft, soft_targets)
 
     @property
     def floor(self) -> float:  # type: ignore[override]
@@ -61,11 +57,6 @@ class MeshObjective(Objective):
     def refine(self) -> None:
         """Go over to float64 rotations."""
         self.dtype, self.tracker.slack = torch.float64, 1e-4
-
-    def identity(self) -> Tensor:
-        """The identity as the rotation of every cell."""
-        eye = torch.eye(3, dtype=torch.float64, device="cpu")
-        return eye[:, :, None].expand(3, 3, self.factor.rest.topology.num_cells)
 
     def matrices(self, x: Tensor, dtype: torch.dtype) -> Tensor:
         """S of every cell over `scale`, or its change if x is one; differentiable."""
@@ -119,92 +110,3 @@ class MeshObjective(Objective):
     def spread(self, values: Tensor) -> Tensor:
         """The value as (1, 1)."""
         return values[:, None]
-
-
-def minimise(
-    objective: MeshObjective, x: Tensor, *, max_iter: int, tol: float, refine: bool
-) -> tuple[Tensor, ARAPInfo]:
-    """L-BFGS whose metric is the factored stiffness, so that its first step is one of local-global.
-
-    The turning of the rotations makes the energy flatter than its stiffness L says. By how much, the last step s and
-    change y of the gradient tell: the metric is L over s^T L s / s^T y, at least 1. `minimise_batch` does the same
-    without a branch on the data; here branches cost nothing, and save the masks over all vectors.
-
-    Args:
-        objective: what to minimise.
-        x: (V, 3) positions that meet the handles.
-        max_iter: evaluations at most.
-        tol: residual at which to stop.
-        refine: go over to float64 rotations once float32 ones have done what they can.
-
-    Returns:
-        Positions, and the report.
-    """
-    dot = objective.dot
-    history: list[tuple[Tensor, Tensor, Tensor]] = []
-    energy, gradient = objective(x)
-    image, stretch = objective.image, 1.0
-    slack = 1e-13 * objective.constant.abs()
-    negative = False
-    while True:
-        direction = _two_loops(objective, history, gradient, stretch)
-        decrease = dot(gradient, direction)
-        # Without a history this is g^T L^-1 g; with one it knows the curvature too, and is mostly larger.
-        residual = objective.relative(decrease, energy)
-        coarse = refine and objective.dtype == torch.float32
-        if coarse and tol < 1e-7 and residual <= 1e-7:
-            objective.refine()
-            energy, gradient = objective(x)
-            history.clear()
-            image, stretch = objective.image, 1.0
-            continue
-        if residual <= tol or objective.evaluations >= max_iter:
-            break
-        step, accepted = 1.0, False
-        for _ in range(HALVINGS):
-            candidate = torch.sub(x, direction, alpha=step)
-            new_energy, new_gradient = objective(candidate)
-            accepted = bool(new_energy <= energy - SUFFICIENT * step * decrease + slack)
-            if accepted or objective.evaluations >= max_iter:
-                break
-            step *= 0.5
-        if not accepted:
-            if history:
-                history.clear()
-            elif coarse:
-                objective.refine()
-                energy, gradient = objective(x)
-                image = objective.image
-            else:
-                break
-            stretch = 1.0
-            continue
-        move, change = direction.mul_(-step), new_gradient - gradient
-        curvature = dot(move, change)
-        negative = bool(curvature < 0)
-        if curvature > 0:
-            history = [*history[1 - MEMORY :], (move, change, 1 / curvature)]
-            stretch = float((dot(move, objective.image - image) / curvature).clamp(1.0, LONGEST))
-        else:
-            history.clear()
-            stretch = 1.0
-        x, energy, gradient, image = candidate, new_energy, new_gradient, objective.image
-    ended = residual <= tol
-    if history:
-        residual = objective.residual(energy, gradient)
-    evaluations = torch.tensor([objective.evaluations], device="cpu")
-    return x, objective.info(energy, evaluations, residual, ended, torch.tensor([negative], device="cpu"))
-
-
-def _two_loops(
-    objective: MeshObjective, history: list[tuple[Tensor, Tensor, Tensor]], gradient: Tensor, stretch: float
-) -> Tensor:
-    """The L-BFGS inverse Hessian applied to a gradient."""
-    dot, right, shares = objective.dot, gradient.clone(), []
-    for move, change, inverse in reversed(history):
-        shares.append(inverse * dot(move, right))
-        right.addcmul_(change, shares[-1], value=-1)
-    direction = objective.solve(right).mul_(stretch)
-    for (move, change, inverse), share in zip(history, reversed(shares), strict=True):
-        direction.addcmul_(move, share - inverse * dot(change, direction))
-    return direction

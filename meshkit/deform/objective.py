@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from meshkit.deform.face_edges import FaceEdges
+from meshkit.deform.batched_rest import BatchedRest
 from meshkit.deform.options import ARAPInfo
+from meshkit.deform.rest import ARAPRest
 
 __all__ = ["Objective"]
 
@@ -22,15 +23,13 @@ class Objective(ABC):
     from the last rotations on the CPU, batched products without a branch on a GPU.
 
     Args:
-        verts: (V, 3) rest positions about the origins.
-        edges: of the rest shapes.
+        rest: the rest shapes.
         stiffness: (V, V) sparse L + W.
         soft: (V, 1) soft weights over m, or None.
         soft_targets: (V, 3) t; differentiable.
 
     Attributes:
         free: (V, 1) or (V, 3) bool, the vertices to solve for.
-        force_at_rest: B^T R where every rotation is the identity.
         constant: (B,) what the energy holds beside its terms in x.
         image: (L + W) x of the last evaluation.
         floor: share of the constant that a residual is relative to where the energy is less.
@@ -42,20 +41,15 @@ class Objective(ABC):
     look: int
 
     def __init__(
-        self, verts: Tensor, edges: FaceEdges, stiffness: Tensor, soft: Tensor | None, soft_targets: Tensor | None
+        self, rest: ARAPRest | BatchedRest, stiffness: Tensor, soft: Tensor | None, soft_targets: Tensor | None
     ) -> None:
-        self.verts, self.edges, self.stiffness, self.soft = verts, edges, stiffness, soft
-        self.image = verts
-        self.force_at_rest = self.pulled_back(self.identity())
-        self.constant = self.dot(verts, self.force_at_rest)
+        self.verts, self.edges, self.force_at_rest = rest.verts, rest.edges, rest.force_at_rest
+        self.stiffness, self.soft, self.image = stiffness, soft, rest.verts
+        self.constant = self.dot(self.verts, self.force_at_rest)
         self.pull: Tensor | None = None
         if soft is not None and soft_targets is not None:
             self.pull = soft * soft_targets
             self.constant = self.constant + self.dot(self.pull.detach(), soft_targets.detach())
-
-    @abstractmethod
-    def identity(self) -> Tensor:
-        """The identity as the rotation of every cell."""
 
     @abstractmethod
     def pulled_back(self, rotations: Tensor) -> Tensor:

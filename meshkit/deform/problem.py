@@ -1,22 +1,21 @@
-"""What there is to deform: the checks of shapes, and what can be done with it."""
+"""What there is to deform: the checks of shapes, which need no look at the values."""
 
-from abc import ABC, abstractmethod
 from dataclasses import fields
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from meshkit.deform.options import ARAPInfo, Options
+from meshkit.deform.options import ARAPInfo
 from meshkit.topology import check_faces
 
 __all__ = ["Problem"]
 
 
-class Problem(ABC):
-    """The meshes of a batch, apart or as a whole. Here are the checks that need no look at the values.
+class Problem:
+    """The meshes of a batch; `MeshByMesh` takes them apart, `WholeBatch` keeps them together.
 
-    What the methods take and give for handles and positions is of a kind of the subclass.
+    Both have the same methods, ``positions``, ``weights``, ``handles``, ``random_handles``, ``goal``, ``goal_at``,
+    ``deform`` and ``energies``, each with handles and positions of its own kind.
 
     Attributes:
         shape, dtype, device: of the given positions, (V, 3) or (B, V, 3).
@@ -41,40 +40,6 @@ class Problem(ABC):
         check_faces(faces, self.size, batched=self.batched)
         if faces.dim() == 3 and len(faces) != self.batch:
             raise ValueError(f"faces {tuple(faces.shape)} and verts {tuple(self.shape)} differ in batch size")
-
-    @abstractmethod
-    def positions(self, values: Tensor, name: str) -> Any:
-        """Positions of the shape of `verts`; differentiable."""
-
-    @abstractmethod
-    def weights(self, values: Tensor, name: str) -> Any:
-        """Weights (V,) or (B, V), at least 0; differentiable."""
-
-    @abstractmethod
-    def handles(self, handles: Tensor) -> Any:
-        """Given handles (H,) or (B, H), padded with -1."""
-
-    @abstractmethod
-    def random_handles(self, fraction: float, generator: torch.Generator | None) -> Any:
-        """Random handles: a share of the vertices of each mesh, at least one in every component."""
-
-    @abstractmethod
-    def goal(self, handles: Any, handle_pos: Tensor) -> Any:
-        """Where given handles are to go, (H, 3) or (B, H, 3); differentiable."""
-
-    @abstractmethod
-    def goal_at(self, handles: Any, positions: Any) -> Any:
-        """Where handles are to go if it is the place they have in `positions`."""
-
-    @abstractmethod
-    def deform(
-        self, handles: Any, goal: Any, options: Options, soft_targets: Any, soft_weights: Any, start: Any
-    ) -> tuple[Tensor, ARAPInfo] | None:
-        """Deformed positions and a report, or None for values that this way cannot cope with; so `energies`."""
-
-    @abstractmethod
-    def energies(self, deformed: Tensor) -> Tensor | None:
-        """Energies (B,) of deformed positions; differentiable."""
 
     def report(self, info: ARAPInfo) -> ARAPInfo:
         """The report (B,) as it is given out, () for one mesh."""

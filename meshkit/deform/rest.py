@@ -30,6 +30,7 @@ class ARAPRest:
         laplacian: (V, V) scipy CSR matrix L, positive semi-definite.
         moments, moments_t: (3K, V) scipy CSR matrix B, whose rows 3i + d give column d of S_i, and its transpose.
         rest_energy: m v^T L v, the energy of collapsing the mesh to a point.
+        force_at_rest: (V, 3) L v, which is B^T R where every rotation is the identity.
         edges: of the faces, and which of them count.
         components: (V,) int64 labels of the components that the weights hold together.
 
@@ -72,7 +73,9 @@ class ARAPRest:
         scaled = weights[:, :, None] * edges / topology.multiplicity
         entries = topology.moment @ scaled.transpose(1, 0, 2).reshape(3, -1)
         self.moments, self.moments_t = topology.interleaved.matrices(entries.reshape(-1, 3))
-        self.rest_energy = topology.multiplicity * float(np.vdot(v, self.laplacian @ v))
+        force = self.laplacian @ v
+        self.force_at_rest = torch.from_numpy(force)
+        self.rest_energy = topology.multiplicity * float(np.vdot(v, force))
         # An edge opposite two right angles weighs zero and still lies in the cells of spokes and rims.
         joined = weights != 0 if topology.energy == "spokes" else np.broadcast_to(regular[:, None], weights.shape)
         tail, head = f[:, [2, 0, 1]][joined], f[:, [1, 2, 0]][joined]

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from meshkit.deform.batched_factor import BatchedFactor
-from meshkit.deform.batched_objective import BatchedObjective, minimise_batch
+from meshkit.deform.batched_objective import BatchedObjective
 from meshkit.deform.batched_rest import BatchedRest
 from meshkit.deform.face_edges import EnergyOfMeshes
+from meshkit.deform.lbfgs import minimise_batch
 from meshkit.deform.minimum import minimum
 from meshkit.deform.options import ARAPInfo, Options
 from meshkit.deform.problem import Problem
@@ -147,8 +148,7 @@ class WholeBatch(Problem):
         x = self.positions(deformed, "deformed")
         if self.refused():
             return None
-        verts = torch.where(self.mask[..., None], self.verts.double() - self.rest.origin, 0.0)
-        flat = verts.flatten(0, 1), x.flatten(0, 1)
-        rotations = self.rest.rotations(flat[1].detach()).permute(2, 1, 0).contiguous()
-        energies: Tensor = EnergyOfMeshes.apply(*flat, self.rest.edges, rotations, self.batch)
+        verts = torch.where(self.mask[..., None], self.verts.double() - self.rest.origin, 0.0).flatten(0, 1)
+        rotations = self.rest.rotations(x.detach().flatten(0, 1)).permute(2, 1, 0).contiguous()
+        energies: Tensor = EnergyOfMeshes.apply(verts, x.flatten(0, 1), self.rest.edges, rotations, self.batch)
         return energies
