@@ -252,6 +252,19 @@ def test_a_saddle_is_reported(device: str) -> None:
 
 
 @ON_DEVICES
+@pytest.mark.parametrize("solver", ["splu", "dense"])
+def test_a_saddle_is_reported_for_its_mesh(device: str, solver: str) -> None:
+    verts, faces = (value.to(device) for value in grid(5, seed=0))
+    handles = torch.tensor([0, 4, 20, 24], device=device)
+    pos = torch.stack([1.01 * verts[handles], -1.5 * verts[handles]]).requires_grad_()
+    x, info = arap_deform(verts.expand(2, -1, 3), faces, handles, pos, max_iter=1, solver=solver)
+    assert info.negative_curvature.tolist() == [False, False]
+    with pytest.warns(UserWarning, match="negative curvature: the deformation is a saddle"):
+        x.square().sum().backward()
+    assert info.negative_curvature.tolist() == [False, True]
+
+
+@ON_DEVICES
 def test_bad_input_is_described_by_the_other_path(device: str) -> None:
     verts, faces = (value.to(device) for value in grid(4, seed=0))
     good = {"verts": verts, "faces": faces, "handles": torch.tensor([0, 7]).to(device), "handle_pos": verts[[0, 7]]}
@@ -273,6 +286,7 @@ def test_bad_input_is_described_by_the_other_path(device: str) -> None:
         ({"verts": nan}, "verts holds NaN"),
         ({"verts": flat}, "faces have an edge of length zero"),
         ({"verts": verts.long()}, "verts must be a floating"),
+        ({"verts": verts.expand(0, -1, 3)}, r"verts \(0, 16, 3\) holds no vertex"),
         ({"verts": verts[None], "faces": faces.expand(2, -1, 3)}, "differ in batch size"),
         ({"faces": faces + 1}, r"face indices must lie in \[0, 16\)"),
         ({"handles": torch.tensor([0, 16])}, r"handles must lie in \[0, 16\)"),

@@ -73,8 +73,8 @@ class MeshByMesh(Problem):
         return rows
 
     @staticmethod
-    def _finite(values: Tensor, chosen: Any, message: str) -> list[Tensor]:
-        own = [row[index] for row, index in zip(values.cpu().double().unbind(0), chosen, strict=True)]
+    def _finite(values: Tensor, chosen: list[Tensor], message: str) -> list[Tensor]:
+        own = [row.index_select(0, index) for row, index in zip(values.cpu().double().unbind(0), chosen, strict=True)]
         if not all(bool(torch.isfinite(row).all()) for row in own):
             raise ValueError(message)
         return own
@@ -106,8 +106,9 @@ class MeshByMesh(Problem):
 
     def goal(self, handles: tuple[list[Tensor], Tensor], handle_pos: Tensor) -> list[Tensor]:
         """Positions (h, 3) of the handles of each mesh."""
-        used = handles[1]
-        return self._finite(self.target_rows(handle_pos, used.shape[1]), used, "handle_pos holds NaN or infinity")
+        given = self.target_rows(handle_pos, handles[1].shape[1])
+        used = [row.nonzero().squeeze(1) for row in handles[1]]
+        return self._finite(given, used, "handle_pos holds NaN or infinity")
 
     def goal_at(self, handles: tuple[list[Tensor], Any], positions: list[Tensor]) -> list[Tensor]:
         """Positions (h, 3) of the handles of each mesh."""
