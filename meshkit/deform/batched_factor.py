@@ -52,7 +52,8 @@ def _dense(rows: Tensor, cols: Tensor, values: Tensor, free: Tensor) -> Callable
     inverse = torch.linalg.solve_triangular(lower, identity.expand_as(lower), upper=False)
 
     def solve(right: Tensor) -> Tensor:
-        return (inverse.mT @ (inverse @ right.view(batch, size, 3))).view(-1, 3)
+        right = torch.where(free[..., None], right.view(batch, size, 3), 0.0)
+        return (inverse.mT @ (inverse @ right)).view(-1, 3)
 
     return solve
 

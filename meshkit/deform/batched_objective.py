@@ -46,7 +46,7 @@ class BatchedObjective(Objective):
         return rotations.permute(2, 1, 0).contiguous()
 
     def solve(self, right: Tensor) -> Tensor:
-        """Apply the inverse of the stiffness of the free vertices; 0 at the others, where `right` is 0 too."""
+        """Apply the inverse of the stiffness of the free vertices; 0 at the others, whatever `right` is there."""
         return self._solve(right)
 
     def dot(self, a: Tensor, b: Tensor) -> Tensor:

@@ -23,8 +23,8 @@ def conjugate_gradients(
 
     Args:
         product: A, symmetric.
-        precondition: symmetric positive; what it gives 0 stays 0.
-        right: (N, D) the right-hand sides b.
+        precondition: symmetric positive, but for rows that it ignores and gives 0.
+        right: (N, D) the right-hand sides b; what the preconditioner gives 0 is not solved for.
         dot: one number per system from two vectors (N, D).
         spread: of numbers per system what broadcasts with (N, D).
         tol: relative accuracy, in the norm of the preconditioner.
@@ -33,24 +33,25 @@ def conjugate_gradients(
     """
     solution, residual = torch.zeros_like(right), right
     direction = precondition(residual)
-    square = first = dot(residual, direction)
+    square = dot(residual, direction)
+    goal = tol * tol * square
     negative = torch.zeros_like(square, dtype=torch.bool)
     for iteration in range(max_iter):
-        done = (square <= tol * tol * first) | negative
-        if iteration % look == 0 and bool(done.all()):
+        moving = (square > goal) & ~negative
+        if iteration % look == 0 and not bool(moving.any()):
             break
         image = product(direction)
         curvature = dot(direction, image)
-        negative = negative | (~done & (curvature <= 0))
-        moving = ~done & ~negative
+        bent = moving & (curvature <= 0)
+        negative, moving = negative | bent, moving & ~bent
         if iteration == 0:  # the preconditioner's step is better than none
-            solution = torch.where(spread(negative), direction, solution)
-        step = spread(torch.where(moving, square / torch.where(moving, curvature, 1.0), 0.0))
+            solution = torch.where(spread(bent), direction, solution)
+        step = spread(torch.where(moving, square / curvature, 0.0))
         solution = torch.addcmul(solution, step, direction)
         residual = torch.addcmul(residual, step, image, value=-1)
         scaled = precondition(residual)
         before, square = square, torch.where(moving, dot(residual, scaled), square)
-        share = torch.where(moving, square / torch.where(moving, before, 1.0), 0.0)
+        share = torch.where(moving, square / before, 0.0)
         direction = torch.addcmul(scaled, spread(share), direction)
     return solution, negative
 
@@ -72,7 +73,7 @@ def column_solver(matrix: Tensor, inverse: Tensor, *, batch: int, look: int = 16
             inverse.mul,
             right,
             dot=lambda a, b: (a * b).view(batch, size, 3).sum(1),
-            spread=lambda values: values.repeat_interleave(size, 0),
+            spread=lambda values: values if batch == 1 else values.repeat_interleave(size, 0),
             tol=1e-10,
             max_iter=10 * size,
             look=look,

@@ -98,7 +98,7 @@ class FaceEdges:
             value = (self.weights(v) * (work - (image * v).sum(0))).sum()
         (edges,) = torch.autograd.grad(value, v)
         corners = torch.stack([edges[:, k - 1] - edges[:, k - 2] for k in range(3)], 1)
-        gathered = torch.zeros_like(verts.T)
+        gathered = verts.new_zeros(3, len(verts))
         return gathered.index_add_(1, self.faces.T.flatten(), corners.flatten(1)).T
 
 

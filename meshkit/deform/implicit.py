@@ -51,16 +51,16 @@ class ImplicitMinimum(torch.autograd.Function):
         """Solve for the adjoint, then differentiate the stationarity condition."""
         x, soft_targets = ctx.saved_tensors
         objective: Objective = ctx.objective
-        edges, free, soft = objective.edges, objective.free, objective.soft
+        edges, soft = objective.edges, objective.soft
         R, turned = objective.linearise(x, precise=ctx.options.grad_tol < 1e-4)
 
         def product(direction: Tensor, change: Tensor) -> Tensor:
             return objective.stiffness @ direction - objective.pulled_back(change)
 
         adjoint, negative = conjugate_gradients(
-            lambda direction: torch.where(free, product(direction, turned(direction)), 0.0),
+            lambda direction: product(direction, turned(direction)),
             objective.solve,
-            torch.where(free, grad, 0.0),
+            grad,
             dot=objective.dot,
             spread=objective.spread,
             tol=ctx.options.grad_tol,
@@ -78,7 +78,7 @@ class ImplicitMinimum(torch.autograd.Function):
             rotations = (objective.component_first(value) for value in (R, change))
             grads[0] = -edges.stationarity_gradient(objective.verts, x, adjoint, *rotations)
         if wanted[1]:
-            grads[1] = torch.where(free, 0.0, grad - product(adjoint, change))
+            grads[1] = torch.where(objective.free, 0.0, grad - product(adjoint, change))
         if soft is not None and wanted[2]:
             grads[2] = soft * adjoint
         if soft is not None and wanted[3]:

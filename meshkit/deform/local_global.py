@@ -22,9 +22,9 @@ def alternate(
         tol: stop when an iteration lowered the energy by at most this share, from the second one on; 0 for never.
             Above 0 the host waits for the device in every iteration.
     """
-    free, stiffness, floor = objective.free, objective.stiffness.matmul, 1e-10 * objective.constant
+    stiffness, floor = objective.stiffness.matmul, 1e-10 * objective.constant
     pulled = linear(goal, stiffness, stiffness)
-    x = goal if start is None else torch.where(free, start, goal)
+    x = goal if start is None else torch.where(objective.free, start, goal)
     guess = None
     done = torch.zeros_like(floor, dtype=torch.bool)
     count = torch.zeros_like(floor, dtype=torch.int64)
@@ -35,8 +35,7 @@ def alternate(
             force = objective.pulled_back(rotations)
         if objective.pull is not None:
             force = force + objective.pull
-        right = torch.where(free, force - pulled, 0.0)
-        moved = linear(right, objective.solve, objective.solve) + goal
+        moved = linear(force - pulled, objective.solve, objective.solve) + goal
         count += ~done
         if tol > 0 and (iteration or start is not None):
             moved = torch.where(objective.spread(done), x, moved)

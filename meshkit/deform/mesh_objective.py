@@ -40,8 +40,7 @@ class MeshObjective(Objective):
         count = len(factor.free)
         self._place = torch.full((size,), count, dtype=torch.int32, device="cpu")
         self._place[factor.free] = torch.arange(count, dtype=torch.int32, device="cpu")
-        # One flag per coordinate: a mask that broadcasts costs three times as much on the CPU.
-        self.free = (self._place < count)[:, None].repeat(1, 3)
+        self.free = (self._place < count)[:, None]
         soft = None if factor.soft is None else factor.soft[:, None]
         super().__init__(rest, csr_of_scipy(factor.stiffness), soft, soft_targets)
 

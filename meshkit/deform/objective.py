@@ -29,7 +29,7 @@ class Objective(ABC):
         soft_targets: (V, 3) t; differentiable.
 
     Attributes:
-        free: (V, 1) or (V, 3) bool, the vertices to solve for.
+        free: (V, 1) bool, the vertices to solve for.
         constant: (B,) what the energy holds beside its terms in x.
         image: (L + W) x of the last evaluation.
         floor: share of the constant that a residual is relative to where the energy is less.
@@ -73,7 +73,7 @@ class Objective(ABC):
 
     @abstractmethod
     def solve(self, right: Tensor) -> Tensor:
-        """Apply the inverse of the stiffness of the free vertices; 0 at the others, where `right` is 0 too."""
+        """Apply the inverse of the stiffness of the free vertices; 0 at the others, whatever `right` is there."""
 
     @abstractmethod
     def dot(self, a: Tensor, b: Tensor) -> Tensor:
@@ -84,13 +84,13 @@ class Objective(ABC):
         """Values per mesh as a column that broadcasts with vectors."""
 
     def __call__(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Energies (B,), and half gradients (V, 3), zero at fixed vertices."""
+        """Energies (B,), and half gradients (V, 3), of which the fixed vertices' part is of no concern."""
         force = self.pulled_back(self.tracked_rotations(x))
         if self.pull is not None:
             force += self.pull.detach()
         self.image = self.stiffness @ x
         energy = self.dot(x, torch.sub(self.image, force, alpha=2)) + self.constant
-        return energy, torch.where(self.free, self.image - force, 0.0)
+        return energy, self.image - force
 
     def residual(self, energy: Tensor, gradient: Tensor) -> Tensor:
         """Decrease g^T L^-1 g that one local-global iteration is sure to bring, relative."""

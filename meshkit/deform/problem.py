@@ -28,7 +28,7 @@ class Problem:
             raise ValueError(
                 f"verts must be a floating (V, 3) or (B, V, 3) tensor, got {verts.dtype} {tuple(verts.shape)}"
             )
-        if not len(verts):
+        if not verts.numel():
             raise ValueError(f"verts {tuple(verts.shape)} holds no vertex")
         self.shape, self.dtype, self.device = verts.shape, verts.dtype, verts.device
         self.batched = verts.dim() == 3
