@@ -1,50 +1,72 @@
 """What ``meshkit-transfer`` does before PyTorch is imported: its options, and mistakes that cost nothing to find."""
 
 import argparse
-import difflib
 import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
+
+from meshkit._names import did_you_mean, nearest, shipped_weights
 
 __all__ = ["FORMATS", "UNITS", "check", "main", "parser"]
 
 FORMATS = (".obj", ".ply", ".off", ".stl", ".glb")
 UNITS = ("m", "cm", "mm", "in", "ft")
+_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
+_WRITTEN_OUT = {"metres": "m", "centimetres": "cm", "millimetres": "mm", "inches": "in", "feet": "ft", "foot": "ft"}
 
 
 class _Parser(argparse.ArgumentParser):
     """Tells a mistake in one line, and names the option that was probably meant."""
 
     def error(self, message: str) -> NoReturn:
-        known = [option for action in self._actions for option in action.option_strings if option.startswith("--")]
+        known = [option for option in self._option_string_actions if option.startswith("--")]
         for word in re.findall(r"--[\w-]+", message) if "unrecognized" in message else ():
-            near = difflib.get_close_matches(word, known, n=1)
-            message += f"; did you mean {near[0]}?" if near else ""
+            message += did_you_mean(word, known)
         self.exit(2, f"error: {message}; --help lists the options\n")
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
         """Takes ``--pose-facing -y`` as well as ``--pose-facing=-y``: an axis is no option."""
         words: list[str] = []
         for word in sys.argv[1:] if args is None else args:
-            if words and word in ("-x", "-y", "-z") and words[-1].endswith(("-up", "-facing")):
+            if words and self._is_value(word) and self._takes_axis(words[-1]):
                 words[-1] += f"={word}"
             else:
                 words.append(word)
         return super().parse_known_args(words, namespace)
 
-    def format_help(self) -> str:
-        from meshkit.models import pretrained_names
+    def _is_value(self, word: str) -> bool:
+        return re.match("-[^-]", word) is not None and word[:2] not in self._option_string_actions
 
-        self.epilog = f"Weights that come with this installation: {', '.join(pretrained_names()) or 'none'}."
+    def _takes_axis(self, word: str) -> bool:
+        """Whether a word is an option whose value is an axis, or the beginning of that option alone."""
+        known = self._option_string_actions
+        found = [word] if word in known else [option for option in known if option.startswith(word)]
+        return len(found) == 1 and found[0].startswith("--") and found[0].endswith(("-up", "-facing"))
+
+    def format_help(self) -> str:
+        self.epilog = f"Weights that come with this installation: {', '.join(shipped_weights()) or 'none'}."
         return super().format_help()
+
+
+def _one_of(names: Sequence[str], written_out: Mapping[str, str] | None = None) -> Callable[[str], str]:
+    """A type of argparse's: one of the names. A mistake is told with the nearest of them, and all there are."""
+    meant = {name: name for name in names} | dict(written_out or {})
+
+    def read(word: str) -> str:
+        if word in names:
+            return word
+        near = nearest(word, meant)
+        instead = "" if near is None else f": did you mean {meant[near]}?"
+        raise argparse.ArgumentTypeError(f"takes {', '.join(names[:-1])} or {names[-1]}, got {word!r}{instead}")
+
+    return read
 
 
 def parser() -> argparse.ArgumentParser:
     """What the command takes."""
-    axes = ("+x", "-x", "+y", "-y", "+z", "-z")
     made = _Parser(
         prog="meshkit-transfer",
         description="Give the body of IDENTITY the pose of POSE: any two meshes (obj, ply, off, stl, glb). POSE may "
@@ -64,13 +86,15 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--weights", default="auto", help="auto, a name, or the folder of a training run")
     made.add_argument("--refine", type=float, metavar="WEIGHT", help="weight of the network's result (default: 0.1)")
     made.add_argument("--no-refine", action="store_true", help="the network's result as it is")
+    frames = ("pose", "identity")
     made.add_argument(
-        "--frame", choices=("pose", "identity"), default="pose", help="axes, unit and place of the result"
+        "--frame", type=_one_of(frames), choices=frames, default="pose", help="axes, unit and place of the result"
     )
+    axis, unit = _one_of(_AXES), _one_of(UNITS, _WRITTEN_OUT)
     for role in ("identity", "pose"):
-        made.add_argument(f"--{role}-up", choices=axes, help="signed axis to the head (default: found)")
-        made.add_argument(f"--{role}-facing", choices=axes, help="signed axis of the gaze (default: found)")
-        made.add_argument(f"--{role}-unit", choices=UNITS, help="unit of the file (default: guessed)")
+        made.add_argument(f"--{role}-up", type=axis, choices=_AXES, help="signed axis to the head (default: found)")
+        made.add_argument(f"--{role}-facing", type=axis, choices=_AXES, help="signed axis of the gaze (default: found)")
+        made.add_argument(f"--{role}-unit", type=unit, choices=UNITS, help="unit of the file (default: guessed)")
     made.add_argument("--report", type=Path, metavar="FILE", help="save the reports, with all numbers, as JSON")
     made.add_argument("--skip-bad", action="store_true", help="of many poses, leave out those that cannot be used")
     made.add_argument("--device", default="cpu", help="cpu, cuda, ... (default: cpu)")

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr
 from dataclasses import fields, is_dataclass
-from difflib import get_close_matches
 from itertools import takewhile
 from operator import attrgetter
 from pathlib import Path
@@ -17,6 +16,8 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 import tyro
 from _run import UserError
+
+from meshkit._names import did_you_mean
 
 T = TypeVar("T")
 KINDS: dict[Any, str] = {int: "a whole number", float: "a number", str: "a word", Path: "a path", NoneType: "None"}
@@ -88,8 +89,7 @@ def mistake(kind: type, words: Sequence[str], said: str) -> str:
         flag, given, value = word.partition("=")
         name = setting(word, known)
         if name is None:
-            near = get_close_matches(flag.replace("_", "-"), list(flags(known)), n=1)
-            return f"there is no option {flag}" + (f": did you mean {near[0]}?" if near else "")
+            return f"there is no option {flag}{did_you_mean(flag, flags(known))}"
         if known[name] is bool:
             values_given = [value] if given else list(takewhile(lambda w: not w.startswith("--"), words[place + 1 :]))
             if values_given:
@@ -103,8 +103,11 @@ def mistake(kind: type, words: Sequence[str], said: str) -> str:
     name = setting(blamed[0], known) if blamed else None
     if blamed is None or name is None:
         return text
-    came = ", ".join(map(repr, values(blamed[0], words))) or "nothing"
-    return f"{blamed[0]} takes {meaning(known[name]).rstrip(',')}, got {came}"
+    came = values(blamed[0], words)
+    allowed = choices(known[name])
+    wrong = next((value for value in came if value not in allowed), "")
+    got = ", ".join(map(repr, came)) or "nothing"
+    return f"{blamed[0]} takes {meaning(known[name]).rstrip(',')}, got {got}{did_you_mean(wrong, allowed)}"
 
 
 def flags(known: dict[str, Any]) -> Iterator[str]:
@@ -130,6 +133,13 @@ def values(flag: str, words: Sequence[str]) -> list[str]:
             upto = next(i for i, w in enumerate(rest) if w.startswith("--"))
             found = [word.partition("=")[2]] if "=" in word else rest[:upto]
     return found
+
+
+def choices(hint: Any) -> list[str]:
+    """The words that a setting of this type takes, if they are all known."""
+    if get_origin(hint) is Literal:
+        return list(map(str, get_args(hint)))
+    return [word for inner in get_args(hint) for word in choices(inner)]
 
 
 def meaning(hint: Any) -> str:

@@ -14,6 +14,7 @@ import torch
 from _run import Run, UserError
 from torch import Tensor, nn
 
+from meshkit._names import did_you_mean
 from meshkit.data import (
     RELEASED_SPLITS,
     MeshEntry,
@@ -54,7 +55,8 @@ def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -
     """Training and test pairs of ``--data``; those of rigged bodies are made on ``device``."""
     kind, _, place = cfg.data.partition(":")
     if kind not in ("humans", "animals", "smpl", "smal", *SCANNERS) or (kind in ("humans", "animals")) == bool(place):
-        raise UserError(f"--data must be {KINDS}; got {cfg.data!r}")
+        close = did_you_mean(kind, ("humans", "animals", "smpl", "smal", *SCANNERS))
+        raise UserError(f"--data must be {KINDS}; got {cfg.data!r}{close}")
     if place and not Path(place).exists():
         raise UserError(f"--data {cfg.data}: there is no {place}")
     try:

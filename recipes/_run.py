@@ -71,8 +71,8 @@ class Run:
             raise UserError(f"cannot write to {folder}: {error.strerror}. Choose another folder with --out") from None
 
     def remove_if_empty(self) -> None:
-        """Take back a folder made by this run that holds nothing of worth: no checkpoint, log, pool or cache."""
-        worth = ("state.pt", "log.jsonl", "pool_*", "cache_*")
+        """Take back a folder made by this run that holds nothing of worth: no checkpoint, log, pool, cache, figures."""
+        worth = ("state.pt", "log.jsonl", "pool_*", "cache_*", "summary.json")
         kept = (path for name in worth for path in self.folder.glob(name) if path.is_dir() or path.stat().st_size)
         if self.writes and self._made and not any(kept):
             shutil.rmtree(self.folder, ignore_errors=True)

@@ -34,10 +34,12 @@ def check(cfg: Any) -> None:
         "eval_every",
         "save_every",
     )
+    if cfg.steps == 0 and cfg.init is None:
+        raise UserError("--steps 0 evaluates weights without training: say with --init which")
     for name in counts:
         value = getattr(cfg, name, None)
-        if value is not None and value < 1:
-            raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+        if value is not None and value < (name != "steps"):
+            raise UserError(f"--{name.replace('_', '-')} must be at least {int(name != 'steps')}, got {value}")
     for name in ("sampled_identities", "sampled_poses", "workers", "threads", "warmup"):
         if getattr(cfg, name, 0) < 0:
             raise UserError(f"--{name.replace('_', '-')} must not be negative, got {getattr(cfg, name)}")

@@ -73,7 +73,8 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
         if cfg.init is not None and state is None:  # before the descriptors, which take longer
             initialize(generator, cfg)
         with fabric.rank_zero_first():
-            train_pairs, test_pairs = data(cfg, run, torch.get_num_threads(), fabric.device)
+            needed = replace(cfg, pool=2) if cfg.steps == 0 else cfg  # evaluation alone looks at no training mesh
+            train_pairs, test_pairs = data(needed, run, torch.get_num_threads(), fabric.device)
     except (ValueError, RuntimeError) as error:
         raise UserError(str(error)) from None
     pool = getattr(train_pairs, "pool", None)
@@ -113,7 +114,7 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
         unit="step",
         dynamic_ncols=True,
         smoothing=0.05,
-        disable=not run.writes,
+        disable=not run.writes or steps == 0,
     )
     for s in bar:
         asked = time.perf_counter()
@@ -146,6 +147,7 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
     interruption.over()
     if run.writes:
         facts = {
+            "init": cfg.init,
             "steps": steps,
             "pairs_seen": steps * pairs_per_step,
             "processes": fabric.world_size,

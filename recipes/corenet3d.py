@@ -17,13 +17,13 @@ from typing import Literal
 import torch
 from _apply import apply
 from _data import inputs
-from _run import guard
+from _run import UserError, guard
 from _settings import Settings, parse
 from _train import train
 from torch import Tensor
 
 from meshkit.data import PairBatch
-from meshkit.losses import edge_ratio_loss, reconstruction_loss
+from meshkit.losses import edge_ratio_loss, matching_loss, reconstruction_loss
 from meshkit.models.presets import PRESETS as MODELS
 
 
@@ -34,9 +34,11 @@ class Config(Settings):
     name: str = "corenet3d"
     """Name of the run."""
     lambda_rec: float = 1000.0
-    """Weight of the reconstruction. Released code: 1000."""
+    """Weight of the reconstruction. Released code: 1000. With 0 for it and the edge loss, the matching alone learns."""
     lambda_edge: float = 0.5
     """Weight of the edge loss (length ratios). Released code: 0.5."""
+    lambda_match: float = 0.0
+    """Weight of the likelihood of the true matches, which the data must know. Paper: 0, reconstruction alone."""
     norm: Literal["elain", "spadain"] | None = None
     """Conditional norm of the blocks, None for that of --model.norm; spadain is the paper's ablation of ElaIN."""
 
@@ -85,11 +87,18 @@ def build(cfg: Config) -> tuple[torch.nn.Module, torch.nn.Module]:
 
 def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float) -> dict[str, Tensor]:
     """The weighted losses of one step."""
-    output = system(batch.identity, batch.pose, **inputs(batch)).vertices
-    return {
-        "rec": cfg.lambda_rec * reconstruction_loss(output, batch.ground_truth, mask=batch.identity_mask),
-        "edge": cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces),
-    }
+    result = system(batch.identity, batch.pose, **inputs(batch))
+    output = result.vertices
+    losses = {}
+    if cfg.lambda_rec:
+        losses["rec"] = cfg.lambda_rec * reconstruction_loss(output, batch.ground_truth, mask=batch.identity_mask)
+    if cfg.lambda_edge:
+        losses["edge"] = cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces)
+    if cfg.lambda_match:
+        if not bool((batch.correspondence >= 0).any()):
+            raise UserError(f"--lambda-match needs true matches, which --data {cfg.data} does not know: drop it")
+        losses["match"] = cfg.lambda_match * matching_loss(result.plan, batch.correspondence)
+    return losses
 
 
 def main() -> None:

@@ -18,6 +18,7 @@ FOUNDATION = {
     "_checks",
     "_compile",
     "_connectivity",
+    "_names",
     "_numerics",
     "_repr",
     "batching",
@@ -29,6 +30,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "_checks": set(),
     "_compile": set(),
     "_connectivity": {"_compile", "_numerics", "topology"},
+    "_names": set(),
     "_numerics": set(),
     "_repr": set(),
     "batching": set(),
@@ -49,7 +51,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "viz": {"io"},
     "data": FOUNDATION | {"io", "descriptors"},
 }
-MAY_IMPORT["_transfer_command"] = {"models", "transfer"}  # inside functions: it checks options without PyTorch
+MAY_IMPORT["_transfer_command"] = {"_names", "transfer"}  # the latter inside functions: options need no PyTorch
 MAY_IMPORT["transfer"] = set(MAY_IMPORT)
 
 # Third-party packages importable at module level; everything else is imported inside the function that needs it.

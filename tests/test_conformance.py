@@ -30,6 +30,7 @@ from meshkit.losses import (
     EdgeLengthLoss,
     EdgeRatioLoss,
     LaplacianLoss,
+    MatchingLoss,
     NormalConsistencyLoss,
     ReconstructionLoss,
     SinkhornDivergenceLoss,
@@ -97,6 +98,11 @@ def with_plan(inputs: Inputs) -> Inputs:
         mask_y=inputs.get("pose_mask"),
     )
     return {**inputs, "plan": plan.dense()}
+
+
+def with_matches(inputs: Inputs) -> Inputs:
+    plan = with_plan(inputs)["plan"]
+    return {"plan": plan, "correspondence": plan.detach().argmax(2)}
 
 
 def rigged() -> RiggedModel:
@@ -248,6 +254,13 @@ ENTRIES |= {
         {"identity_features": ("a", 4), "pose_features": ("b", 4), "pose_verts": ("b", 3)},
         {"a": ["identity_mask"], "b": ["pose_mask"]},
         prepare=with_plan,
+        out=None,
+    ),
+    "MatchingLoss": Entry(
+        MatchingLoss,
+        {"identity_features": ("a", 4), "pose_features": ("b", 4)},
+        {"a": ["identity_mask"], "b": ["pose_mask"]},
+        prepare=with_matches,
         out=None,
     ),
 }

@@ -13,8 +13,10 @@ from meshkit.data import (
     RiggedModel,
     load_humans,
     rotation_matrices,
+    sample_bone_factors,
     sample_identities,
     sample_poses,
+    scale_bones,
 )
 
 
@@ -248,6 +250,63 @@ def test_sampled_poses_need_poses_of_the_joints():
     for parents in ([-1, 0, 1, -1, 3], [3, 0, 1, -1, 2]):
         with pytest.raises(ValueError, match="joint 0 must be the root"):
             sample_poses(torch.randn(4, 5, 3), torch.tensor(parents), 2)
+
+
+def test_bones_are_scaled_as_the_equation_says():
+    body = synthetic_rig()
+    verts, joints = body.shape(torch.tensor([0, 1]))
+    factors = rand(2, body.num_joints, 3).exp()
+    moved, placed = scale_bones(verts, joints, body.weights, body.parents, factors)
+    for b in range(2):
+        q = [joints[b, 0]]
+        for j, parent in enumerate(body.parents.tolist()[1:], 1):
+            q.append(q[parent] + factors[b, parent].diag() @ (joints[b, j] - joints[b, parent]))
+        for v in range(verts.shape[1]):
+            place = sum(
+                w * (factors[b, j].diag() @ (verts[b, v] - joints[b, j]) + q[j]) for j, w in enumerate(body.weights[v])
+            )
+            assert torch.allclose(moved[b, v], place, rtol=0, atol=1e-12)
+        assert torch.allclose(placed[b], torch.stack(q), rtol=0, atol=1e-13)
+    one = torch.ones_like(factors)
+    assert all(map(torch.allclose, scale_bones(verts, joints, body.weights, body.parents, one), (verts, joints)))
+    grown, _ = scale_bones(verts, joints, body.weights, body.parents, 2 * one)  # all alike: about the root
+    assert torch.allclose(grown - joints[:, :1], 2 * (verts - joints[:, :1]))
+
+
+def test_bone_factors_are_those_of_limbs_and_of_both_sides():
+    """Logarithms of mean 0; a limb's joints have variance 5/4 and covariance 1; left and right are the same."""
+    humans = load_humans(1000)
+    factors = sample_bone_factors(humans.joints, humans.parents, 20_000, spread=0.3).double().log() / 0.3
+    assert factors.mean((0, 2)).abs().max() < 0.03
+    knee, ankle, other_knee, head = 4, 5, 10, 16  # of the shipped humans; the legs are its second and third limb
+    assert humans.joints[[knee, other_knee], 0].sum().abs() < 1e-3
+    assert torch.equal(factors[:, knee], factors[:, other_knee])
+    assert not torch.equal(factors[:, knee], factors[:, ankle])
+    cov = torch.stack([factors[:, j, 2] for j in (knee, ankle, head)]).cov()
+    expected = torch.tensor([[1.25, 1.0, 0.0], [1.0, 1.25, 0.0], [0.0, 0.0, 1.25]], dtype=torch.float64)
+    assert torch.allclose(cov, expected, atol=0.05)
+    assert torch.equal(
+        *(
+            sample_bone_factors(
+                humans.joints, humans.parents, 2, spread=0.2, generator=torch.Generator().manual_seed(1)
+            )
+            for _ in range(2)
+        )
+    )
+    assert bool((sample_bone_factors(humans.joints, humans.parents, 2, spread=0.0) == 1).all())
+
+
+def test_bones_of_other_shapes_are_refused():
+    body = synthetic_rig()
+    verts, joints = body.shape(torch.tensor([0]))
+    with pytest.raises(ValueError, match=r"factors must have shape \(1, \d+, 3\), got \(2, 3\)"):
+        scale_bones(verts, joints, body.weights, body.parents, torch.ones(2, 3))
+    with pytest.raises(ValueError, match="joint 0 must be the root"):
+        scale_bones(verts, joints, body.weights, body.parents.flip(0), torch.ones_like(joints))
+    with pytest.raises(ValueError, match=r"joints must have shape \(\d+, 3\), got \(1, \d+, 3\)"):
+        sample_bone_factors(joints, body.parents, 2, spread=0.1)
+    with pytest.raises(ValueError, match=r"count and spread must not be negative, got 2 and -0\.1"):
+        sample_bone_factors(joints[0], body.parents, 2, spread=-0.1)
 
 
 def test_sampling_needs_two_identities():

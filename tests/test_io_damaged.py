@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import tracemalloc
 import warnings
 import zipfile
@@ -24,6 +25,9 @@ TEXT = PLY.format("ascii", 3, 1) + FACES
 BINARY = PLY.format("binary_little_endian", 3, 1) + FACES
 ROWS = "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 SOLID = "solid s\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+
+
+A_FACE = "a face is its list vertex_indices, a list its length and so many numbers, three corners or more"
 
 
 def content(kind: str) -> bytes:
@@ -119,6 +123,50 @@ def test_text_ply_with_more_in_it(tmp_path: Path) -> None:
     assert faces.tolist() == [[0, 1, 2], [0, 2, 3], [2, 1, 0]]
 
 
+@pytest.mark.parametrize("row", ["2 5 5 7 3 0 1 2 2", "1 5 7 7 3 0 1 2", "-1 7 3 0 1 2", "1.5 5 7 3 0 1 2"])
+def test_lists_before_the_corners_have_the_size_they_say(row: str, tmp_path: Path) -> None:
+    """A number too many behind and before, a negative size, and one that is no whole number."""
+    header = PLY.format("ascii", 3, 1) + "property list uchar float uv\nproperty int flags\n" + FACES
+    (tmp_path / "m.ply").write_text(f"{header}{ROWS[:-8]}{row}\n")
+    said = f"line 15, '{row}': a face is its numbers and lists uv, flags, vertex_indices, a list its length"
+    with pytest.raises(MeshFileError, match=re.escape(said)):
+        load_mesh(tmp_path / "m.ply")
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_ply_with_a_comment_that_is_no_ascii(kind: str, tmp_path: Path) -> None:
+    data = TEXT + ROWS if kind == "text" else BINARY
+    data = data.replace("element vertex", "comment caf\xe9\nelement vertex").encode("latin-1")
+    if kind == "binary":
+        data += np.eye(3, dtype="<f4").tobytes() + b"\3" + np.arange(3, dtype="<i4").tobytes()
+    (tmp_path / "m.ply").write_bytes(data)
+    assert load_mesh(tmp_path / "m.ply")[1].tolist() == [[0, 1, 2]]
+
+
+def test_text_ply_with_empty_lines(tmp_path: Path) -> None:
+    (tmp_path / "m.ply").write_text(TEXT + "\n" + ROWS.replace("\n", "\n \n"))
+    assert load_mesh(tmp_path / "m.ply")[1].tolist() == [[0, 1, 2]]
+
+
+def test_text_ply_takes_little_memory(tmp_path: Path) -> None:
+    """Lines are parsed batch by batch, and no text of them is kept."""
+    ball = trimesh.creation.icosphere(5)
+    (tmp_path / "m.ply").write_bytes(ball.export(file_type="ply", encoding="ascii"))
+    load_mesh(tmp_path / "m.ply")  # imports
+    tracemalloc.start()
+    verts, faces = load_mesh(tmp_path / "m.ply")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * (tmp_path / "m.ply").stat().st_size
+    np.testing.assert_array_equal(faces.numpy(), ball.faces)
+    np.testing.assert_allclose(verts.numpy(), ball.vertices, atol=1e-6)
+
+
+def test_a_solid_may_have_any_name(tmp_path: Path) -> None:
+    (tmp_path / "m.stl").write_text(SOLID.replace("solid s", "solid endfacet") + "endsolid endfacet\n")
+    assert load_mesh(tmp_path / "m.stl")[1].tolist() == [[0, 1, 2]]
+
+
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [
@@ -132,7 +180,7 @@ def test_text_ply_with_more_in_it(tmp_path: Path) -> None:
         ("m.ply", TEXT.replace("float y", "float x"), "'property float x' is no line of the header of a PLY file"),
         ("m.ply", TEXT.replace("element face", "element vertex"), "'element vertex 1' is no line of the header"),
         ("m.ply", TEXT.replace("end_header", "comment end_header"), "'comment end_header' is no line of the header"),
-        ("m.ply", TEXT.replace("float y", "half y") + ROWS, "damaged: KeyError of trimesh, 'half'; copy or export it"),
+        ("m.ply", TEXT.replace("float y", "half y") + ROWS, "'property half y' is no line of the header of a PLY file"),
         ("m.ply", TEXT.replace("element vertex", "element point"), "it has no vertices with x, y, z"),
         ("m.ply", TEXT.replace("float y", "float v"), "it has no vertices with y"),
         ("m.ply", TEXT.replace("float z", "list uchar float z"), "it has no vertices with z"),
@@ -140,12 +188,15 @@ def test_text_ply_with_more_in_it(tmp_path: Path) -> None:
         ("m.ply", TEXT.replace("element face 1", "element face 0"), "no faces; a point cloud must be meshed first"),
         ("m.ply", TEXT.replace("vertex_indices", "corners"), "no list of integers vertex_indices or vertex_index"),
         ("m.ply", TEXT.replace("uchar int", "uchar float"), "no list of integers vertex_indices or vertex_index"),
-        ("m.ply", TEXT + ROWS.replace("1 0 0", "1 0"), "damaged: ValueError of trimesh, .*; copy or export it again"),
-        ("m.ply", TEXT + ROWS.replace("1 0 0", "1 b 0"), "damaged: ValueError of trimesh, .*; copy or export it again"),
-        ("m.ply", TEXT + ROWS.replace("1 0 0\n", "1 0 0\n\n"), "claims 4 lines, none of them empty, and 3 are there"),
-        ("m.ply", TEXT + "0 0 0\n", "its header claims 4 lines, none of them empty, and 1 are there; copy or export"),
-        ("m.ply", TEXT + ROWS.replace("3 0 1 2", "2 0 1"), "has faces with fewer than three corners; copy or export"),
-        ("m.ply", TEXT + ROWS.replace("3 0 1 2", "4 0 1 2"), "face 0 says it has 4 corners, trimesh reads 3; copy or"),
+        ("m.ply", TEXT + ROWS.replace("1 0 0", "1 0"), "line 11, '1 0': a vertex is three numbers; mend that line, or"),
+        ("m.ply", TEXT + ROWS.replace("1 0 0", "1 b 0"), "line 11, '1 b 0': a vertex is three numbers; mend that line"),
+        ("m.ply", TEXT + ROWS.replace("1 0 0", "7 1 0 0"), "line 11, .*names 3 numbers of a vertex, here are 4; mend"),
+        ("m.ply", TEXT + "0 0 0\n", "the file ends too early: 1 of 3 vertices are there; copy or export it again"),
+        ("m.ply", TEXT + ROWS[:-8], "the file ends too early: 0 of 1 faces are there; copy or export it again"),
+        ("m.ply", TEXT + ROWS.replace("3 0 1 2", "2 0 1"), f"line 13, '2 0 1': {A_FACE}; mend that line, or export"),
+        ("m.ply", TEXT + ROWS.replace("3 0 1 2", "4 0 1 2"), f"line 13, '4 0 1 2': {A_FACE}; mend that line, or"),
+        ("m.ply", TEXT + ROWS.replace("3 0 1 2", "3 0 1 2 2"), f"line 13, '3 0 1 2 2': {A_FACE}; mend that line"),
+        ("m.ply", TEXT + ROWS.replace("3 0 1 2", "3 0 1 .5"), f"line 13, '3 0 1 .5': {A_FACE}; mend that line, or"),
         ("m.ply", BINARY.encode() + bytes(30), "its header claims 37 bytes or more and 30 are there; copy or export"),
         ("m.ply", BINARY.encode() + bytes(36), "its header claims 37 bytes or more and 36 are there; copy or export"),
         ("m.ply", BINARY.encode() + bytes(38), "PLY is unexpected length!; copy it again, or export it with triangles"),

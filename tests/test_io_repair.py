@@ -55,6 +55,24 @@ def test_report_agrees_with_trimesh(mesh: tuple[Tensor, Tensor]) -> None:
     assert report.problems == ()
 
 
+def test_seams_are_no_holes() -> None:
+    """Files with texture coordinates repeat vertices: their faces share places, not numbers."""
+    verts, faces = SPHERE
+    soup = verts[faces].reshape(-1, 3), torch.arange(3 * len(faces)).reshape(-1, 3)
+    report = mesh_report(*soup)
+    assert (report.boundary_edges, report.seam_edges, report.holes) == (3 * len(faces), 3 * len(faces), 0)
+    assert not report.watertight and "closed but for seams" in str(report) and "hole" not in str(report)
+    seams = f"{3 * len(faces)} boundary edges along seams of repeated vertices, which clean_mesh welds"
+    clean = clean_mesh(*soup)
+    assert seams in report.problems and mesh_report(clean.verts, clean.faces).watertight
+    # Two faces that share no edge are gone, and half of the sphere is cut off from the other.
+    rest = faces[verts[faces].mean(1)[:, 2].argsort()][1:-1]
+    half = torch.cat([rest[: len(rest) // 2], rest[len(rest) // 2 :] + len(verts)])
+    cut = mesh_report(torch.cat([verts, verts]), half)
+    assert (cut.holes, cut.boundary_edges - cut.seam_edges, cut.boundary_loops) == (2, 6, 4)
+    assert "2 holes (6 boundary edges)" in cut.problems and "surface  open" in str(cut)
+
+
 def test_report_names_every_defect() -> None:
     verts, faces = union(SPHERE, (TETRA[0] / 2, TETRA[1]))
     verts = torch.cat([verts, verts[:1], torch.full((1, 3), 7.0)])  # repeated, and both unreferenced
@@ -68,7 +86,7 @@ def test_report_names_every_defect() -> None:
     assert report.duplicate_verts == 1
     assert report.unreferenced_verts == 2
     assert report.components == (320, 4)
-    assert (report.boundary_edges, report.boundary_loops) == (3, 1)
+    assert (report.boundary_edges, report.boundary_loops, report.seam_edges, report.holes) == (3, 1, 0, 1)
     assert report.crowded_edges == 3
     assert report.flipped_edges == 3
     assert not report.watertight and not report.manifold and report.genus is None and report.volume is None

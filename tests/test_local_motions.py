@@ -210,3 +210,16 @@ def test_a_weight_must_be_positive() -> None:
     for weight in (0.0, float("inf"), float("nan")):
         with pytest.raises(ValueError, match=f"weight must be positive and finite, got {weight}"):
             poisson_deform(torch.zeros(1, 4, 3), torch.zeros(1, 4, 3), radius=1.0, weight=weight)
+
+
+@BOTH
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("which", ["rest", "target", "features"])
+def test_a_number_that_is_not_finite_spoils_its_own_sample_alone(which: str, bad: float, deform: Any) -> None:
+    inputs = {"rest": rand(2, 12, 3), "target": rand(2, 12, 3, seed=1), "features": rand(2, 12, 4, seed=2)}
+    truth = deform(**inputs, radius=1.0)
+    inputs[which] = inputs[which].clone()
+    inputs[which][0, 5, 1] = bad
+    spoilt = deform(**inputs, radius=1.0)
+    assert spoilt[0].isnan().all()
+    torch.testing.assert_close(spoilt[1], truth[1])

@@ -12,10 +12,12 @@ from meshkit.losses import (
     BackwardCorrespondenceLoss,
     EdgeLengthLoss,
     EdgeRatioLoss,
+    MatchingLoss,
     ReconstructionLoss,
     backward_correspondence_loss,
     edge_length_loss,
     edge_ratio_loss,
+    matching_loss,
     reconstruction_loss,
 )
 from meshkit.ot import sinkhorn
@@ -566,3 +568,70 @@ V, P = torch.zeros(2, 5, 3), torch.ones(2, 4, 5)
 def test_errors(call, match):
     with pytest.raises(ValueError, match=match):
         call()
+
+
+# Likelihood of known matches
+
+KNOWN = torch.tensor([[2, 0, 1, -1, 0, 2], [4, -1, 0, 3, -1, -1]])  # of the rows of `matching`; its third has no mass
+
+
+@reductions
+def test_matching_equals_loops(matching, reduction):
+    plan, *_, plans, _ = matching
+    samples = []
+    for part, columns in zip(plans, KNOWN.tolist(), strict=True):
+        terms = [
+            -math.log(row[c] / sum(row)) for row, c in zip(part.tolist(), columns, strict=False) if c >= 0 < sum(row)
+        ]
+        samples.append((sum(terms), len(terms)))
+    assert samples[0][1] == 4 and samples[1][1] == 3
+    assert_close(matching_loss(plan, KNOWN, reduction=reduction), reduce_literally(samples, reduction))
+    assert_close(MatchingLoss(reduction=reduction)(plan, KNOWN), reduce_literally(samples, reduction))
+
+
+@pytest.mark.parametrize("reach", [None, 0.5], ids=["balanced", "unbalanced"])
+def test_matching_of_a_factored_plan_is_that_of_the_stored_one(reach):
+    x, y = (rand(2, n, 4, seed=n).requires_grad_() for n in (9, 7))
+    masks = {"mask_x": torch.arange(9) < torch.tensor([[9], [6]]), "mask_y": torch.arange(7) < torch.tensor([[5], [7]])}
+    known = torch.randint(-1, 5, (2, 9), generator=torch.Generator().manual_seed(0))
+    plan = sinkhorn(x, y, eps=0.1, reach=reach, **masks)
+    factored, stored = matching_loss(plan, known), matching_loss(plan.dense(), known)
+    torch.testing.assert_close(factored, stored, rtol=1e-12, atol=0)
+    for a, b in zip(
+        *(torch.autograd.grad(value, (x, y), retain_graph=True) for value in (factored, stored)), strict=True
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)
+        assert bool(a.isfinite().all()) and float(a.abs().max()) > 1e-3
+
+
+def test_matching_reaches_what_is_matched_to_the_wrong_place():
+    """Where the true entry underflows in the stored plan, its logarithm and gradient are still right."""
+    y = torch.tensor([[[1.0, 0.0], [-1.0, 1e-2]]])
+    x = y.clone().requires_grad_()
+    plan = sinkhorn(x, y, eps=0.005)
+    assert float(plan.dense()[0, 0, 1].detach()) == 0
+    loss = matching_loss(plan, torch.tensor([[1, -1]]))
+    assert loss.item() == pytest.approx(2 / 0.005, rel=1e-3)
+    assert float(torch.autograd.grad(loss, x)[0].abs().max()) > 0.1
+
+
+def test_matching_bounds():
+    uniform = torch.full((1, 3, 8), 0.2)
+    assert matching_loss(uniform, torch.tensor([[0, 3, 7]])).item() == pytest.approx(math.log(8))
+    assert matching_loss(torch.eye(3)[None], torch.tensor([[0, 1, 2]])).item() == 0
+    assert matching_loss(uniform, torch.full((1, 3), -1)).item() == 0
+    assert matching_loss(uniform.bfloat16(), torch.tensor([[0, 3, 7]])).dtype == torch.float32
+
+
+def test_matching_errors():
+    plan = torch.ones(2, 3, 4)
+    with pytest.raises(
+        ValueError, match=r"correspondence must be integers of shape \(B, N\) = \(2, 3\), got torch.int64"
+    ):
+        matching_loss(plan, torch.zeros(2, 4, dtype=torch.int64))
+    with pytest.raises(ValueError, match=r"got torch.float32 of \(2, 3\)"):
+        matching_loss(plan, torch.zeros(2, 3))
+    with pytest.raises(ValueError, match=r"a plan must have shape \(B, N, M\), got \(3, 4\)"):
+        matching_loss(plan[0], torch.zeros(3, dtype=torch.int64))
+    with pytest.raises(ValueError, match="reduction must be one of"):
+        MatchingLoss(reduction="max")

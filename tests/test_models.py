@@ -449,6 +449,8 @@ def test_released_matching_reads_like_a_plan():
         lambda p: p.barycentric(values),
         lambda p: p.row_sums(),
         lambda p: p.marginals()[1],
+        lambda p: p.log_at(torch.arange(12).expand(2, -1)),
+        lambda p: p.log_at(torch.full((2, 12), -1)).exp(),
     ):
         assert_near(read(plan), read(expected), 1e-5)
     assert torch.equal(plan.argmax(), expected.argmax()) and torch.equal(plan.argmax(1), expected.argmax(1))
@@ -673,8 +675,9 @@ def test_spectral_normalisation_sits_on_the_blocks_alone(spectral):
 # Errors of the forward pass
 
 
-@pytest.mark.parametrize("option", [{"n_iters": 1.5}, {"k": 4.5}])
+@pytest.mark.parametrize("option", [{"n_iters": 1.5}, {"k": 4.5}, {"n_iters": 5.0}, {"k": 8.0}])
 def test_counts_are_whole_numbers(option):
+    """Also those that the functions called in the forward pass would refuse."""
     with pytest.raises(ValueError, match="n_iters and k must be whole numbers, got"):
         make(**option)
 

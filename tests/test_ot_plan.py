@@ -31,6 +31,14 @@ MASKS = {"mask_x": torch.tensor([[True] * 4, [True, False, True, True]])}
 
 # Gradients of the readings
 
+
+def some_columns(plan: TransportPlan) -> Tensor:
+    """One of each row, but of the second none."""
+    columns = torch.arange(plan.shape[1], device=plan.device) % plan.shape[2]
+    columns[1] = -1
+    return columns.expand(plan.shape[0], -1)
+
+
 FURTHER = {
     "row_potential": lambda p, v, u: p.potentials[0].nan_to_num(neginf=0.0),
     "column_potential": lambda p, v, u: p.potentials[1],
@@ -39,6 +47,8 @@ FURTHER = {
     "topk_columns": lambda p, v, u: p.topk(3, dim=1)[0],
     "T-topk": lambda p, v, u: p.T.topk(2)[0],
     "log_dense": lambda p, v, u: p.log_dense().nan_to_num(neginf=0.0),
+    "log_at": lambda p, v, u: p.log_at(some_columns(p)).nan_to_num(neginf=0.0),
+    "T-log_at": lambda p, v, u: p.T.log_at(some_columns(p.T)).nan_to_num(neginf=0.0),
 }
 ALL = {**{name: read for name, (read, _) in READINGS.items()}, **FURTHER}
 
@@ -552,6 +562,26 @@ def test_values_of_another_shape(shape):
             method(torch.ones(shape, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"\(B, M\) = \(2, 4\), got \(2, 6, 1\)"):
         plan.T @ torch.ones(2, 6, 1)
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+def test_log_at_reads_single_entries(transposed, padded):
+    """Also of rows and columns in the padding or without weight, whose logarithm is -inf."""
+    plan = padded.T if transposed else padded
+    batch, rows, number = plan.shape
+    columns = torch.randint(-1, number, (batch, rows), generator=torch.Generator().manual_seed(3))
+    expected = plan.log_dense().gather(2, columns.clamp_min(0)[..., None])[..., 0].masked_fill(columns < 0, -torch.inf)
+    found = plan.log_at(columns)
+    assert torch.equal(found.isneginf(), expected.isneginf()) and 0 < int(found.isneginf().sum()) < found.numel()
+    assert_near(found.exp(), expected.exp(), 1e-15)
+    assert_near(found.nan_to_num(neginf=0.0), expected.nan_to_num(neginf=0.0), 1e-12)
+
+
+@pytest.mark.parametrize("columns", [torch.zeros(2, 5, dtype=torch.int64), torch.zeros(2, 4)])
+def test_log_at_errors(columns):
+    plan = sinkhorn(rand(2, 4, 3), rand(2, 6, 3, seed=1))
+    with pytest.raises(ValueError, match=r"columns must be integers of shape \(B, N\) = \(2, 4\), got torch\.\w+ of"):
+        plan.log_at(columns)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Sinkhorn at the edges: tiny and huge eps, features that are zero, opposite, equal or not finite, and every error."""
 
+import importlib
 import itertools
 import math
 import re
@@ -620,3 +621,10 @@ def test_pages_of_passes_that_do_not_reach_the_kernel_do_not_pile_up():
         torch.autograd.grad(out, values, retain_graph=True)
     assert len(plan._samples[0].kernel.ledger._pages) <= 2
     assert_near(torch.autograd.grad(out, fx)[0], expected, 1e-13)
+
+
+def test_a_divergence_reads_its_options_once(monkeypatch):
+    module = importlib.import_module("meshkit.ot.divergence")
+    calls, read = [], module.read_options
+    monkeypatch.setattr(module, "read_options", lambda *options: calls.append(options) or read(*options))
+    assert sinkhorn_divergence(X, Y, eps=0.5).isfinite().all() and len(calls) == 1

@@ -217,7 +217,7 @@ def test_a_run_that_began_with_others_has_their_commands(exporter, finished_run,
     shipped = json.loads((ROOT / "meshkit" / "weights" / "xdualnet-humans.json").read_text())
     monkeypatch.setattr("safetensors.torch.load", lambda _: pytest.fail("a card needs no weights"))
     first = begun("first", init="xdualnet-humans", seed=1)
-    second = begun("second", init=str(first), seed=2, sampled_poses=30)
+    second = begun("second", init=str(first), seed=2, sampled_poses=30, sampled_identities=12, bone_spread=0.2)
     found = runs(second, "new")
     earlier = [*shipped["before"], shipped]  # these weights began with others themselves
     assert [run["seed"] for run in found] == [*(run["seed"] for run in earlier), 1, 2]
@@ -228,8 +228,11 @@ def test_a_run_that_began_with_others_has_their_commands(exporter, finished_run,
         assert run["command"].count("--name") == 1 and run["machine"] == known["machine"]
     for number, run in enumerate(found[-2:], len(earlier)):
         assert run["command"].endswith(f" --no-corr --init runs/new-{number} --name new-{number + 1}")
+    assert ["--bone-spread 0.2" in run["command"] for run in found[-2:]] == [False, True]
     assert ["--sampled-poses 30" in run["command"] for run in found[-2:]] == [False, True]
-    assert "and 850 poses, 30 more put together" in exporter.trained_on(found, exporter.load_shipped("humans")[1])
+    assert exporter.trained_on(found, exporter.load_shipped("humans")[1]).startswith(
+        "160 identities, 12 more drawn from their Gaussian with limbs stretched at random, and 850 poses, 30 more put"
+    )
     with pytest.raises(ValueError, match=r"trained on animals, but began with .*second, of humans"):
         runs(begun("third", init=str(second), data="animals"), "new")
     assert "--name" not in runs(finished_run[0], "new")[0]["command"]

@@ -17,6 +17,8 @@ from meshkit.io import MeshFileError
 
 pytest.importorskip("tyro")
 
+DATA = "--data takes one or more values, each humans or animals"
+
 
 def told(monkeypatch: pytest.MonkeyPatch, recipe: str, line: str) -> str:
     """The error that a recipe's command line ends with."""
@@ -39,19 +41,21 @@ def told(monkeypatch: pytest.MonkeyPatch, recipe: str, line: str) -> str:
         ("xdualnet", "--steps", "--steps takes a whole number or None, got nothing"),
         ("xdualnet", "--lr 1e-3x --batch 2", "--lr takes a number, got '1e-3x'"),
         ("xdualnet", "--model.k=a", "--model.k takes a whole number, got 'a'"),
-        ("xdualnet", "--preset tinny", "--preset takes tiny, small or paper, got 'tinny'"),
+        ("xdualnet", "--preset tinny", "--preset takes tiny, small or paper, got 'tinny': did you mean tiny?"),
+        ("xdualnet", "--preset smal", "--preset takes tiny, small or paper, got 'smal': did you mean small?"),
         ("xdualnet", "--apply a.obj", "--apply takes 2 values, each a path, or None, got 'a.obj'"),
         ("xdualnet", "--resume=yes", "--resume takes no value, got 'yes'; --no-resume turns it off"),
         ("xdualnet", "--no-arap true --steps 1", "--no-arap takes no value, got 'true'; --no-arap turns it off"),
         ("xdualnet", "--no-steps 3", "there is no option --no-steps: did you mean --steps?"),
         ("xdualnet", "--model.widths", "--model.widths takes one or more values, each a whole number, got nothing"),
         ("xdualnet", "--model.widths a", "--model.widths takes one or more values, each a whole number, got 'a'"),
-        ("paper_tables", "--data", "--data takes one or more values, each humans or animals, got nothing"),
+        ("paper_tables", "--data", f"{DATA}, got nothing"),
         ("xdualnet", "--model.norm foo", "--model.norm takes elain or spadain, got 'foo'"),
-        ("xdualnet", "--model.descriptors hks", "--model.descriptors takes none or wks, got 'hks'"),
+        ("xdualnet", "--model.descriptors hks", "--model.descriptors takes none or wks, got 'hks': did you mean wks?"),
         ("corenet3d", "--betas 0", "--betas takes 2 values, each a number, got '0'"),
         ("npt", "--seed 1 2", "'2' belongs to no option"),
-        ("paper_tables", "--data human", "--data takes one or more values, each humans or animals, got 'human'"),
+        ("paper_tables", "--data human", f"{DATA}, got 'human': did you mean humans?"),
+        ("paper_tables", "--data humans Animal", f"{DATA}, got 'humans', 'Animal': did you mean animals?"),
         ("deformation_transfer", "--source x", "--source takes subject or template, got 'x'"),
     ],
 )

@@ -17,7 +17,16 @@ import pytest
 import torch
 from recipe_runs import ROOT, read_json, read_log, recipe_module
 
-from meshkit.data import PairBatch, PosePairs, human_split, load_humans, load_shipped
+from meshkit.data import (
+    MeshPool,
+    PairBatch,
+    PosePairs,
+    human_split,
+    load_humans,
+    load_shipped,
+    sample_bone_factors,
+    scale_bones,
+)
 from meshkit.io import save_mesh
 from meshkit.models import GeneratorConfig, load_generator
 from meshkit.norm import SPAdaIN
@@ -86,6 +95,22 @@ def test_corenet3d_compares_with_the_truth(batch: PairBatch) -> None:
     assert float(losses["rec"]) == pytest.approx(float(expected), rel=1e-4)
     penalty = mean_ratio_penalty(output, batch.identity, batch.identity_faces)
     assert float(losses["edge"]) == pytest.approx(cfg.lambda_edge * penalty, rel=1e-4)
+
+
+def test_corenet3d_may_be_told_the_matches(batch: PairBatch) -> None:
+    recipe = recipe_module("corenet3d")
+    cfg = replace(small(recipe), lambda_match=3.0)
+    torch.manual_seed(0)
+    generator, system = recipe.build(cfg)
+    losses = recipe.step(system, batch, cfg, 0.0)
+    plan = generator(batch.identity, batch.pose).plan.dense().detach()
+    shares = plan.gather(2, batch.correspondence[..., None])[..., 0] / plan.sum(2)
+    assert float(losses["match"].detach()) == pytest.approx(-3 * float(shares.log().mean()), rel=1e-4)
+    losses["match"].backward()
+    assert any(p.grad is not None and bool((p.grad != 0).any()) for p in generator.extractor.parameters())
+    unknown = replace(batch, correspondence=torch.full_like(batch.correspondence, -1))
+    with pytest.raises(recipe_module("_run").UserError, match="--lambda-match needs true matches, which --data humans"):
+        recipe.step(system, unknown, cfg, 0.0)
 
 
 def test_corenet3d_for_a_time_without_descriptors(run: Any) -> None:
@@ -263,6 +288,35 @@ def test_sampled_identities_join_the_training_ones_alone(run: Any, without_repor
     assert torch.equal(again.identities, body.identities)
 
 
+def test_limbs_of_sampled_identities_are_stretched(run: Any, without_report: None) -> None:
+    more = ("--data", "animals", "--sampled-identities", 20, "--bone-spread", 0.2, "--steps", 1, *SMALL_EXTRACTOR)
+    folder = run("corenet3d", *more, *WITHOUT_DESCRIPTORS)
+    assert read_json(folder / "config.json")["bone_spread"] == 0.2
+    data = recipe_module("_data")
+    known, split = load_shipped("animals")
+    plain, _ = data.with_sampled_identities(load_shipped("animals")[0], split, 20, seed=0)
+    body, wider = data.with_sampled_identities(load_shipped("animals")[0], split, 20, seed=0, bone_spread=0.2)
+    old = torch.cat([split.train_identities, split.test_identities])
+    pose = torch.zeros_like(old)
+    assert torch.allclose(body(old, pose), known(old, pose), atol=1e-6)
+    new = wider.train_identities[-20:]
+    (rest, joints), (before, joints_before) = body.shape(new), plain.shape(new)
+    factors = sample_bone_factors(
+        known.joints, known.parents, 20, spread=0.2, generator=torch.Generator().manual_seed(0)
+    )
+    expected = scale_bones(before, joints_before, known.weights, known.parents, factors)
+    assert torch.allclose(rest, expected[0], atol=1e-6) and torch.allclose(joints, expected[1], atol=1e-6)
+    assert (rest - before).norm(dim=2).mean() > 0.02
+
+
+def test_stretched_limbs_need_sampled_identities(run: Any) -> None:
+    error = recipe_module("_run").UserError
+    with pytest.raises(error, match="--bone-spread stretches sampled identities: give --sampled-identities too"):
+        run("corenet3d", "--bone-spread", 0.2, "--steps", 1)
+    with pytest.raises(error, match=r"--bone-spread must lie between 0 and 1, got -0\.1"):
+        run("corenet3d", "--bone-spread", -0.1, "--sampled-identities", 4, "--steps", 1)
+
+
 def test_sampled_poses_join_the_training_ones_alone(run: Any, without_report: None) -> None:
     folder = run("corenet3d", "--sampled-poses", 30, "--steps", 1, *SMALL_EXTRACTOR, *WITHOUT_DESCRIPTORS)
     assert read_json(folder / "config.json")["sampled_poses"] == 30
@@ -428,6 +482,28 @@ def test_init_begins_with_the_weights_of_a_run(run: Callable[..., Path], without
     with pytest.raises(recipe_module("_run").UserError, match=said):
         run(*other)
     assert not (tmp_path / "third").exists(), "refused before anything is computed"
+
+
+def test_no_steps_report_what_the_weights_are_worth(run: Callable[..., Path]) -> None:
+    known = run("npt", "--steps", 2, "--model.extractor-widths", 4, 4, 5)
+    run("npt", "--name", "again", "--steps", 0, "--init", known, "--seed", 1, "--model.extractor-widths", 4, 4, 5)
+    first, second = (read_json(known.parent / name / "summary.json") for name in ("run", "again"))
+    assert second["test"] == first["test"] and second["test"]["pmd"] > 0
+    assert (second["init"], second["steps"], second["pairs_seen"]) == (str(known), 0, 0) and first["init"] is None
+    assert (known.parent / "again" / "sheet.png").exists() and not (known.parent / "again" / "state.pt").exists()
+    with pytest.raises(recipe_module("_run").UserError, match="--steps 0 evaluates weights without training: say"):
+        run("npt", "--name", "third", "--steps", 0)
+
+
+def test_no_steps_make_no_more_of_the_training_pool_than_a_pair(
+    run: Callable[..., Path], without_report: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = run("corenet3d", "--steps", 1, *SMALL_EXTRACTOR, "--model.widths", 8, 8)
+    counts, build = [], MeshPool.build
+    monkeypatch.setattr(MeshPool, "build", lambda *a, **options: counts.append(a[3]) or build(*a, **options))
+    size = ("--pool", 50, *SMALL_EXTRACTOR, "--model.widths", 8, 8)
+    run("corenet3d", "--name", "again", "--steps", 0, "--init", known, *size)
+    assert counts == [2]
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 import meshkit._transfer_command as front
 import meshkit.transfer._choose as choose
+from meshkit._names import did_you_mean, nearest
 from meshkit._transfer_command import main, parser
 from meshkit.batching import center
 from meshkit.data import load_animals, load_humans, load_shipped
@@ -50,7 +51,7 @@ from meshkit.transfer import (
 from meshkit.transfer._frames import axis_name, axis_vector, rotations, turn_up, turns_about
 from meshkit.transfer._kinds import Likeness, guess_kind
 from meshkit.transfer._open import named, open_mesh
-from meshkit.transfer._openings import find_openings, opening_lengths
+from meshkit.transfer._openings import boundary_loops, find_openings
 from meshkit.transfer._orient import RestBody
 from meshkit.transfer._units import UNITS, find_scale, scale_to
 from meshkit.transfer.confidence import roughness, row_entropies
@@ -297,7 +298,11 @@ def test_the_report_says_what_was_done(person, mover):
     assert "UNUSUAL  the network changes the identity's edges much in length: 0.0%" in text
     assert result.report.confidence.edge_change == pytest.approx(0, abs=1e-5)
     assert result.report.confidence.identity_distance is None
-    assert "do not say what is usual" in str(transfer_pose(person, mover, weights=copier(), **UPRIGHT).report)
+    unjudged = transfer_pose(person, mover, weights=copier(), **UPRIGHT).report
+    doubted = replace(unjudged, doubts=(Doubt("pose", "odd"),))
+    assert "UNUSUAL  " in str(doubted) and "UNUSUAL  " not in str(unjudged)
+    assert all("do not say what is usual" in str(report) for report in (unjudged, doubted))
+    assert "what is usual" not in str(replace(doubted, calibrated=True))
     assert "all within what is usual" in str(transfer_pose(person, mover, weights=copier(usual=WIDE), **UPRIGHT).report)
 
 
@@ -607,8 +612,11 @@ def test_bad_sequences_are_refused(moves, tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"PK nothing")
     (tmp_path / "bad.glb").write_bytes(b"glTF nothing")
     np.savez(tmp_path / "flat.npz", verts=moves[0][0].numpy(), faces=moves[1].numpy())
-    with pytest.raises(MeshFileError, match=r"not an \.npz file with arrays verts and faces"):
-        read_sequence(tmp_path / "bad.npz")
+    np.savez(tmp_path / "other.npz", faces=moves[1].numpy(), vertices=moves[0].numpy())
+    np.savez(tmp_path / "objects.npz", verts=np.array([{}]), faces=moves[1].numpy())
+    for name, said in (("bad", "damaged or cut short"), ("other", "there is no verts"), ("objects", "holds objects")):
+        with pytest.raises(MeshFileError, match=rf"not an \.npz file with arrays verts and faces \(.*{said}"):
+            read_sequence(tmp_path / f"{name}.npz")
     with pytest.raises(MeshFileError, match="not a readable GLB file"):
         read_sequence(tmp_path / "bad.glb")
     with pytest.raises(MeshFileError, match=r"expected floating verts \(T, V, 3\)"):
@@ -629,7 +637,7 @@ def test_small_files_of_many_poses_do_not_fill_the_memory(moves, tmp_path, monke
     monkeypatch.setattr("meshkit.transfer.sequence._MAX_BYTES", 2**20)
     with pytest.raises(MeshFileError, match="its 40 meshes would take 5 MiB"):
         read_sequence(tmp_path / "m.glb")
-    with pytest.raises(MeshFileError, match="bytes of poses, more than the 1,048,576 allowed"):
+    with pytest.raises(MeshFileError, match=r"bytes, more than the 1,048,576 allowed\)"):
         read_sequence(tmp_path / "m.npz")
     monkeypatch.setattr("meshkit.transfer.sequence._MAX_BYTES", 1000)
     with pytest.raises(MeshFileError, match="bytes, more than the 1,000 allowed"):
@@ -1032,6 +1040,8 @@ def test_mistakes_are_found_before_pytorch_is_imported(tmp_path):
     for words in (["none.obj", "x.obj"], [tmp_path, tmp_path, "--refine", "-1"], ["a", "b", "--frame", "c"]):
         done = subprocess.run([sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True)
         assert done.returncode == 2 and done.stderr.startswith("error: "), done.stderr
+    done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
+    assert done.returncode == 0 and all(name in done.stdout for name in pretrained_names()), done.stdout
 
 
 def test_the_commands_units_are_those_of_the_package():
@@ -1067,6 +1077,38 @@ def test_an_axis_with_a_minus_may_stand_alone():
     assert (args.pose_facing, args.identity_up, args.pose_up) == ("-y", "-z", "+x")
     with pytest.raises(SystemExit):
         parser().parse_args([*words, "-y"])
+    args = parser().parse_args(["a.obj", "b.obj", "--pose-faci", "-y", "--identity-up", "-z", "-o", "c.obj"])
+    assert (args.pose_facing, args.identity_up, args.out) == ("-y", "-z", Path("c.obj"))
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("--pose-up y", "argument --pose-up: takes +x, -x, +y, -y, +z or -z, got 'y': did you mean +y?"),
+        ("--pose-up -Y", "argument --pose-up: takes +x, -x, +y, -y, +z or -z, got '-Y': did you mean -y?"),
+        ("--pose-up up", "argument --pose-up: takes +x, -x, +y, -y, +z or -z, got 'up'"),
+        ("--pose-facing -o b.obj", "argument --pose-facing: expected one argument"),
+        ("--pose -y", "ambiguous option: --pose could match --pose-up, --pose-facing, --pose-unit"),
+        (
+            "--identity-unit centimetre",
+            "argument --identity-unit: takes m, cm, mm, in or ft, got 'centimetre': did you mean cm?",
+        ),
+        ("--pose-unit Inch", "argument --pose-unit: takes m, cm, mm, in or ft, got 'Inch': did you mean in?"),
+        ("--frame identiy", "argument --frame: takes pose or identity, got 'identiy': did you mean identity?"),
+    ],
+)
+def test_a_wrong_choice_is_told_with_the_nearest_and_all(line, said, capsys):
+    with pytest.raises(SystemExit) as caught:
+        parser().parse_args(["a.obj", "b.obj", *line.split()])
+    assert caught.value.code == 2
+    assert capsys.readouterr().err == f"error: {said}; --help lists the options\n"
+
+
+def test_the_nearest_name_is_the_first_of_equals():
+    assert nearest("y", ["+y", "-y"]) == "+y" and nearest("y", ["-y", "+y"]) == "-y"
+    assert nearest("XDUALNET_human", ["xdualnet-animals", "xdualnet-humans"]) == "xdualnet-humans"
+    assert nearest("zebra", ["+y", "humans"]) is None and nearest("a", []) is None
+    assert did_you_mean("zebra", ["humans"]) == "" and did_you_mean("human", ["humans"]) == ": did you mean humans?"
 
 
 def test_reports_say_how_good_the_weights_are(person, mover):
@@ -1189,13 +1231,51 @@ def test_openings_are_measured():
     lids = np.abs(ring.face_normals[:, 2]) > 0.5
     tube = torch.tensor(ring.vertices).float(), torch.tensor(ring.faces[~lids])
     around = 64 * 2 * math.sin(math.pi / 64)
-    assert_near(opening_lengths(*tube), torch.tensor([around, around]).double(), 1e-5)
+    loops, area = boundary_loops(*tube), 64 * math.sin(math.tau / 64) / 2
+    assert_near(loops.length, torch.tensor([around, around]).double(), 1e-5)
+    assert_near(loops.width, torch.tensor([area, area]).mul(4 * math.pi).sqrt().double(), 1e-5)
+    assert_near(loops.facing, torch.zeros(2).double(), 1e-5)
     found = find_openings(*tube)
     assert found.loops == 2 and found.longest == pytest.approx(around / math.sqrt(2 * around), rel=1e-5)
-    assert "2 boundary loops, the longest 1.77 times" in found.doubt
+    assert found.cut == pytest.approx(float(loops.width[0]) / math.sqrt(2 * around), rel=1e-5)
+    assert "2 boundary loops, one as wide as a cut, 1.77 times" in found.doubt
     assert find_openings(10 * tube[0], tube[1]).longest == pytest.approx(found.longest, rel=1e-5)
     closed = find_openings(torch.tensor(ring.vertices), torch.tensor(ring.faces))
-    assert closed == (0, 0.0) and closed.doubt == ""
+    assert closed == (0, 0.0, 0.0) and closed.doubt == ""
+
+
+def sheet(count: int) -> Mesh:
+    """A square of (count - 1) ** 2 squares."""
+    grid = torch.arange(count * count).reshape(count, count)
+    a, b, c, d = (t.flatten() for t in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]))
+    verts = torch.stack([grid // count, grid % count, 0 * grid], 2).reshape(-1, 3).float()
+    return verts, torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])
+
+
+def test_a_hole_and_a_sheet_face_otherwise_than_a_cut():
+    verts, faces = sheet(13)
+    assert_near(boundary_loops(verts, faces).facing, -torch.ones(1).double(), 1e-6)
+    inside = (verts[faces][..., :2].mean(1) - 6).abs().amax(1) < 1  # four squares in the middle
+    for turned in (faces, faces.flip(1)):
+        loops = boundary_loops(verts, turned[~inside])
+        assert_near(loops.facing, torch.tensor([-1.0, 1.0]).double(), 1e-6)
+        assert_near(loops.length, torch.tensor([48.0, 8.0]).double(), 1e-6)
+        assert_near(loops.width, torch.tensor([144.0, 4.0]).mul(4 * math.pi).sqrt().double(), 1e-5)
+    # A jagged edge is longer, and no wider: the corner of every other square of the rim is gone.
+    jagged = torch.cat([faces[:144], faces[144:][verts[faces[144:]][..., 1].amax(1) < 12], faces[-1:]])
+    smooth, rough = boundary_loops(verts, faces), boundary_loops(verts, jagged)
+    assert rough.length[0] > 1.05 * smooth.length[0] and rough.width[0] < smooth.width[0]
+
+
+@pytest.mark.parametrize(("radius", "told"), [(0.04, False), (0.1, True)])
+def test_a_hole_in_the_back_is_no_cut_until_it_is_wide(radius, told):
+    body = load_humans(6890)
+    verts = body.template
+    back = torch.tensor([0.0, verts[:, 1].max(), float(verts[:, 2].quantile(0.7))])
+    middle = verts[((verts - back) ** 2).sum(1).argmin()]
+    gone = (verts - middle).norm(dim=1) < radius
+    found = find_openings(verts, body.faces[~gone[body.faces].any(1)])
+    assert found.loops == 1 and found.longest > 0.1 and bool(found.cut) == told
 
 
 def test_a_wrong_unit_changes_neither_kind_nor_roughness_nor_openings(person):
@@ -1219,7 +1299,7 @@ def test_what_is_cut_off_is_noticed(kind, joint):
     for who in (0, 1):
         assert "give the whole body" in find_openings(*without(kind, joint, who)).doubt
     body = load_shipped(kind)[0]
-    assert find_openings(body.template, body.faces) == (0, 0.0)
+    assert find_openings(body.template, body.faces) == (0, 0.0, 0.0)
 
 
 def test_an_open_mesh_is_in_doubt(mover):
@@ -1227,7 +1307,7 @@ def test_an_open_mesh_is_in_doubt(mover):
     verts, faces = without("humans", 71)
     report = transfer_pose((verts, faces), mover, weights=copier(data="humans", usual=WIDE), **UPRIGHT).report
     (said,) = [text for text in report.warnings if "open" in text]
-    assert said.startswith("the identity mesh is open: 1 boundary loop, the longest 0.3")
+    assert said.startswith("the identity mesh is open: 1 boundary loop, one as wide as a cut, 0.")
     assert report.as_dict()["identity"]["openings"]["loops"] == 1
     body = load_humans()
     net = copier(data="humans", usual=WIDE)

@@ -81,8 +81,11 @@ def errors(run: PretrainedTransfer, body: Any, pairs: torch.Tensor) -> list[floa
 def trained_on(done: list[dict[str, Any]], split: Split) -> str:
     """Identities and poses of runs, and how many were made of them."""
     drawn, mixed = (sum(run.get("sampled", {}).get(what, 0) for run in done) for what in ("identities", "poses"))
+    how = "drawn from their Gaussian"
+    if any("bone_spread" in run.get("sampled", {}) for run in done):
+        how += " with limbs stretched at random"
     return (
-        f"{len(split.train_identities)} identities{f', {drawn} more drawn from their Gaussian,' if drawn else ''} and "
+        f"{len(split.train_identities)} identities{f', {drawn} more {how},' if drawn else ''} and "
         f"{len(split.train_poses)} poses{f', {mixed} more put together from their limbs,' if mixed else ''}"
     )
 

@@ -3,7 +3,8 @@
     python tools/measure_warp.py corenet3d-humans runs/xdualnet --pairs 80
 
 Takes names of shipped weights and folders of runs, as they are: the blocks have learnt with one of the ways alone, that
-of the model's rigid_radius and poisson_weight. The pairs are the first of the fixed test pairs.
+of the model's rigid_radius and poisson_weight. The pairs are the first of the fixed test pairs. With --true-matches
+each vertex goes to its own place on the pose mesh, scaled to the identity's size: what a perfect matching is worth.
 """
 
 from __future__ import annotations
@@ -34,17 +35,21 @@ def main() -> None:
     parser.add_argument("weights", nargs="+", help="names of shipped weights, or folders of runs")
     parser.add_argument("--data", choices=["humans", "animals"], default="humans")
     parser.add_argument("--pairs", type=int, default=80)
+    parser.add_argument("--true-matches", action="store_true", help="instead of the network's matching")
     args = parser.parse_args()
     torch.set_num_threads(1)
     body, split = load_shipped(args.data)
+    told = ", matches given" if args.true_matches else ""
     for name in args.weights:
         net = network(name).eval()
         generator, warped = net.generator, list[Tensor]()
         if not isinstance(generator, PoseTransferGenerator):
             raise SystemExit(f"error: {name} has no matching to warp with")
+        if args.true_matches:
+            generator._warp = lambda *pair: (None, pair[2])  # type: ignore[assignment]  # bodies share a vertex order
         generator.transfer.register_forward_pre_hook(lambda _, inputs, warped=warped: warped.append(inputs[0]))
         trained = generator.rigid_radius, generator.poisson_weight
-        print(f"{name}: PMD (1e-3) of the warped mesh and of the result, mean and median of {args.pairs} pairs")
+        print(f"{name}: PMD (1e-3) of the warped mesh and of the result, mean and median of {args.pairs} pairs{told}")
         for way, settings in WAYS.items():
             generator.rigid_radius, generator.poisson_weight = settings
             errors = []

@@ -63,7 +63,8 @@ def _runs(folder: Path) -> list[dict[str, Any]]:
     init = config.pop("init", None)
     own = {
         "command": command(config),
-        "sampled": {what: config.get(f"sampled_{what}", 0) for what in ("identities", "poses")},
+        "sampled": {what: config.get(f"sampled_{what}", 0) for what in ("identities", "poses")}
+        | ({"bone_spread": config["bone_spread"]} if config.get("bone_spread") else {}),
         "seed": config["seed"],
         "steps": summary["steps"],
         "pairs_seen": summary["pairs_seen"],

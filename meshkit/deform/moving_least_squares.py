@@ -33,7 +33,8 @@ def rigid_moving_least_squares(
             descriptors fit.
 
     Returns:
-        ``(B, N, 3)``. Weights are constants: the gradient to ``rest`` and ``features`` through them is left out.
+        ``(B, N, 3)``. Weights are constants: the gradient to ``rest`` and ``features`` through them is left out. A
+        sample is NaN throughout if a number at one of its real vertices is not finite; the others are as they were.
 
     Raises:
         ValueError: shapes differ or the radius is not positive.

@@ -12,8 +12,16 @@ import numpy as np
 from meshkit.io._lines import COPY_AGAIN
 
 
-def read_arrays(path: Path, names: Iterable[str], max_bytes: int) -> dict[str, np.ndarray]:
+def read_arrays(
+    path: Path, names: Iterable[str], max_bytes: int, *, limit: str = " (max_bytes)"
+) -> dict[str, np.ndarray]:
     """Those of the arrays that are in the file; objects are refused, and so is more than ``max_bytes`` in all.
+
+    Args:
+        path: the file.
+        names: of the arrays, without ``.npy``.
+        max_bytes: of all of them, unpacked.
+        limit: how a caller can raise ``max_bytes``, for the message.
 
     Raises:
         ValueError: what is wrong with the file, without its name.
@@ -26,7 +34,7 @@ def read_arrays(path: Path, names: Iterable[str], max_bytes: int) -> dict[str, n
             wanted = {name: entries[f"{name}.npy"] for name in names if f"{name}.npy" in entries}
             # The sizes of the arrays, not of the compressed file: a small file can unpack to anything.
             if (size := sum(info.file_size for info in wanted.values())) > max_bytes:
-                raise ValueError(f"{size:,} bytes, more than the {max_bytes:,} allowed (max_bytes)")
+                raise ValueError(f"{size:,} bytes, more than the {max_bytes:,} allowed{limit}")
             for name, info in wanted.items():
                 with archive.open(info) as stream:
                     found[name] = _read(name, stream.read(info.file_size))

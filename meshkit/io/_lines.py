@@ -102,16 +102,16 @@ def read_rows(lines: Iterator[Row], count: int, what: str, read: Callable[[list[
         done += len(rows)
 
 
-def add_verts(rows: list[Row], ends: bool, mesh: Growing) -> None:
-    """Vertices, one in a line."""
+def add_verts(rows: list[Row], ends: bool, mesh: Growing, columns: tuple[int, ...] = (0, 1, 2)) -> None:
+    """Vertices, one in a line, their coordinates in these columns."""
     try:
-        mesh.add_verts(table([row for _, row in rows], float, (0, 1, 2)))
+        mesh.add_verts(table([row for _, row in rows], float, columns))
     except ValueError:
         verts = []
         for number, row in rows:
             try:
                 fields = row.split()
-                verts.append([float(fields[column]) for column in range(3)])
+                verts.append([float(fields[column]) for column in columns])
             except (ValueError, IndexError):
                 raise blame(number, row, VERTEX_IS, last=ends and number == rows[-1][0]) from None
         mesh.add_verts(np.array(verts))

@@ -1,14 +1,15 @@
-"""PLY files, text and binary, through trimesh, with checks of what trimesh takes on trust."""
+"""PLY files: binary ones through trimesh, with checks of what trimesh takes on trust."""
 
 import re
-from itertools import islice
+from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from meshkit.io._lines import COPY_AGAIN, EMPTY, TOO_EARLY, Growing, shown
-from meshkit.io._mesh import Indices, Parsed
+from meshkit.io._mesh import Parsed
+from meshkit.io._ply_text import Types, read_text
 from meshkit.io._trimesh import trimesh_reads
 
 _FORMATS = [[b"format", kind, b"1.0"] for kind in (b"ascii", b"binary_little_endian", b"binary_big_endian")]
@@ -16,11 +17,11 @@ _CORNERS = ("vertex_indices", "vertex_index")
 _INTEGERS = re.compile(r"list \w+ u?(char|short|int)\d*")
 _ALIKE = "copy it again, or export it with triangles: in binary all faces must have as many corners as the first"
 _BYTES = (
-    dict.fromkeys(("short", "ushort", "int16", "uint16"), 2)
+    dict.fromkeys(("char", "uchar", "int8", "uint8"), 1)
+    | dict.fromkeys(("short", "ushort", "int16", "uint16"), 2)
     | dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4)
     | dict.fromkeys(("double", "float64"), 8)
 )
-_Types = dict[str, dict[str, str]]  # of the properties of each element
 
 
 def read_ply(path: Path, _limit: int) -> Parsed:
@@ -28,29 +29,26 @@ def read_ply(path: Path, _limit: int) -> Parsed:
     from trimesh.exchange.ply import load_ply
 
     with path.open("rb") as stream:
-        binary, claims, types = _header(stream)
+        binary, length, claims, types = _header(stream)
         name = _corners(claims, types)
-        if binary:
-            claim = sum(rows * _least(types[element]) for element, rows in claims.items())
-            _hold("bytes or more", claim, path.stat().st_size - stream.tell())
-        else:
-            firsts = _first_numbers(stream, claims)
-    remedy = _ALIKE if binary else COPY_AGAIN
-    with path.open("rb") as stream, trimesh_reads(remedy):
+        if not binary:
+            return read_text(enumerate(stream, length + 1), claims, types, name)
+        claim = sum(rows * _least(types[element]) for element, rows in claims.items())
+        _hold("bytes or more", claim, path.stat().st_size - stream.tell())
+    with _Header(path.open("rb", buffering=0)) as stream, trimesh_reads(_ALIKE):  # type: ignore[type-var]
         # The rows, for the mesh of trimesh has quads after triangles; fix_texture would repeat vertices along seams.
         rows = load_ply(stream, fix_texture=False, skip_materials=True)["metadata"]["_ply_raw"]
         verts = np.column_stack([np.ravel(rows["vertex"]["data"][axis]) for axis in "xyz"]).astype(np.float64)
         corners = rows["face"]["data"][name]
-        sizes, corners = (corners[key] for key in corners.dtype.names) if binary else (firsts, corners)
+        sizes, corners = (corners[key] for key in corners.dtype.names)
         lengths = np.array([len(polygon) for polygon in corners])
     _hold("vertices", claims["vertex"], len(verts))
     _hold("faces", claims["face"], len(corners))
     if min(lengths) < 3:
-        raise ValueError(f"damaged: it has faces with fewer than three corners; {remedy}")
-    # trimesh takes the lists of binary data, and of lines with as many numbers, to be as long as the first.
-    if (binary or next(iter(types["face"])) == name) and (wrong := np.flatnonzero(lengths != sizes)).size:
+        raise ValueError(f"damaged: it has faces with fewer than three corners; {_ALIKE}")
+    if (wrong := np.flatnonzero(lengths != sizes)).size:  # trimesh takes all lists to be as long as the first
         first = wrong[0]
-        raise ValueError(f"face {first} says it has {sizes[first]} corners, trimesh reads {lengths[first]}; {remedy}")
+        raise ValueError(f"face {first} says it has {sizes[first]} corners, trimesh reads {lengths[first]}; {_ALIKE}")
     mesh = Growing()
     mesh.add_verts(verts)
     if corners.ndim == 2:
@@ -60,8 +58,15 @@ def read_ply(path: Path, _limit: int) -> Parsed:
     return mesh.parsed()
 
 
-def _header(stream: BinaryIO) -> tuple[bool, dict[str, int], _Types]:
-    """Whether the data are binary, the numbers of rows, and the types; refused where trimesh would guess."""
+class _Header(BufferedReader):
+    """A file whose lines, those of the header, are ASCII: trimesh takes them for UTF-8, and comments may be neither."""
+
+    def readline(self, size: int | None = -1) -> bytes:
+        return super().readline(size).decode("ascii", "replace").encode("ascii", "replace")
+
+
+def _header(stream: BinaryIO) -> tuple[bool, int, dict[str, int], Types]:
+    """Whether the data are binary, the header's lines, the numbers of rows, and the types."""
     if not (first := stream.readline()):
         raise ValueError(EMPTY)
     if first.strip() != b"ply":
@@ -69,26 +74,28 @@ def _header(stream: BinaryIO) -> tuple[bool, dict[str, int], _Types]:
     if (second := stream.readline()).split() not in _FORMATS:  # trimesh looks nowhere else for it
         raise ValueError(f"the second line is {shown(second)}; its format, as 'format ascii 1.0', should stand there")
     rows: dict[str, int] = {}
-    types: _Types = {}
+    types: Types = {}
     element = ""
-    for line in stream:
+    for length, line in enumerate(stream, 3):
         match line.decode(errors="replace").split():
             case ["end_header"]:
-                return b"ascii" not in second, rows, types
+                return b"ascii" not in second, length, rows, types
             case ["comment" | "obj_info", *words] if "end_header" not in words:  # where trimesh would stop
                 pass
             case ["element", element, count] if element not in rows and re.fullmatch("[0-9]{1,15}", count):
                 rows[element], types[element] = int(count), {}
-            case ["property", "list", size, kind, name] if name not in types.get(element, name):
+            case ["property", "list", size, kind, name] if (
+                name not in types.get(element, name) and {size, kind} <= _BYTES.keys()
+            ):
                 types[element][name] = f"list {size} {kind}"
-            case ["property", kind, name] if name not in types.get(element, name):
+            case ["property", kind, name] if name not in types.get(element, name) and kind in _BYTES:
                 types[element][name] = kind
             case _:
                 raise ValueError(f"{shown(line)} is no line of the header of a PLY file; {COPY_AGAIN}")
     raise ValueError(f"{TOO_EARLY}: there is no end_header")
 
 
-def _corners(claims: dict[str, int], types: _Types) -> str:
+def _corners(claims: dict[str, int], types: Types) -> str:
     """The property with the corners of the faces; raises where there is no mesh."""
     missing = [axis for axis in "xyz" if types.get("vertex", {}).get(axis, "list").startswith("list")]
     if missing or not claims["vertex"]:
@@ -104,16 +111,7 @@ def _corners(claims: dict[str, int], types: _Types) -> str:
 
 def _least(kinds: dict[str, str]) -> int:
     """Bytes of a row in binary, where its lists are empty."""
-    return sum(_BYTES.get(kind.removeprefix("list ").split()[0], 1) for kind in kinds.values())
-
-
-def _first_numbers(stream: BinaryIO, claims: dict[str, int]) -> Indices:
-    """What the lines of faces start with in text, -1 if it is no number; the lines of all elements must be there."""
-    before = sum(claims[element] for element in list(claims)[: list(claims).index("face")])
-    starts = [line[:99].split()[:1] for line in islice(stream, sum(claims.values()))]
-    _hold("lines, none of them empty,", sum(claims.values()), sum(map(bool, starts)))
-    faces = starts[before : before + claims["face"]]
-    return np.array([int(start) if start.isdigit() and len(start) < 10 else -1 for (start,) in faces])
+    return sum(_BYTES[kind.removeprefix("list ").split()[0]] for kind in kinds.values())
 
 
 def _hold(what: str, claim: int, there: int) -> None:

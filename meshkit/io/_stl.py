@@ -1,5 +1,6 @@
 """STL files, binary and text, through trimesh: corners of loose triangles that are equal become one vertex."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def _check(path: Path) -> int:
         raise ValueError(f"damaged or cut short: {claim}; {COPY_AGAIN}")
     if not text.rstrip().rpartition(b"\n")[2].lstrip().startswith(b"endsolid"):  # trimesh reads as far as it goes
         raise ValueError(f"cut short: there is no endsolid at its end; {COPY_AGAIN}")
-    return text.count(b"endfacet")
+    return len(re.findall(rb"\bendloop\s+endfacet\b", text))  # and no name of a solid
 
 
 def _weld(verts: Points, faces: Indices) -> tuple[Points, Indices]:

@@ -1,8 +1,9 @@
 """Mesh files in and out, with the order and the number of the vertices kept.
 
 Pose transfer, correspondences and per-vertex errors all rest on the row order of the vertices, so nothing here merges,
-reorders or drops a vertex. OBJ and OFF have readers of their own for that reason: general readers split an OBJ by
-material and repeat vertices along texture seams. PLY, STL and GLB are read through trimesh, between checks.
+reorders or drops a vertex. OBJ, OFF and text PLY have readers of their own for that reason: general readers split an
+OBJ by material and repeat vertices along texture seams. Binary PLY, STL and GLB are read through trimesh, between
+checks.
 """
 
 import os

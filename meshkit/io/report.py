@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from torch import Tensor
 
 from meshkit.io._frame_guess import guess_frame, guess_unit
@@ -26,7 +27,10 @@ class MeshReport:
     Attributes:
         num_verts, num_faces, num_edges: counts. Edges of degenerate faces are left out.
         components: face counts of the parts that share no vertex, largest first.
-        boundary_edges, boundary_loops: edges of one face, and the rings that they form (holes).
+        boundary_edges, boundary_loops: edges of one face, and the rings that they form. A seam, along which vertices
+            are there twice, as files with texture coordinates have them, counts on both sides.
+        seam_edges: boundary edges that have a partner once vertices with the same coordinates are one.
+        holes: rings of the boundary edges that have none.
         crowded_edges: edges of more than two faces.
         touching_verts: vertices at which several fans of faces touch.
         flipped_edges: inner edges whose two faces are turned differently.
@@ -51,6 +55,8 @@ class MeshReport:
     components: tuple[int, ...]
     boundary_edges: int
     boundary_loops: int
+    seam_edges: int
+    holes: int
     crowded_edges: int
     touching_verts: int
     flipped_edges: int
@@ -92,8 +98,11 @@ class MeshReport:
             f"{counted(self.flipped_edges, 'edge')} whose faces are turned differently": self.flipped_edges,
             f"{len(size)} parts (faces: {', '.join(map(str, size[:5]))}{', ...' if len(size) > 5 else ''})": len(size)
             > 1,
-            f"{counted(self.boundary_loops, 'hole')} ({counted(self.boundary_edges, 'boundary edge')})": (
-                self.boundary_edges
+            f"{counted(self.holes, 'hole')} ({counted(self.boundary_edges - self.seam_edges, 'boundary edge')})": (
+                self.holes
+            ),
+            f"{counted(self.seam_edges, 'boundary edge')} along seams of repeated vertices, which clean_mesh welds": (
+                self.seam_edges
             ),
             "turned inside out (negative volume)": self.volume is not None and self.volume < 0,
         }
@@ -102,6 +111,7 @@ class MeshReport:
     def __str__(self) -> str:
         extent = np.subtract(self.high, self.low)
         kind = "watertight" if self.watertight else "open" if self.boundary_edges else "closed"
+        kind = "closed but for seams" if self.boundary_edges and not self.holes else kind
         kind += ", manifold" if self.manifold else ", not manifold"
         if self.genus is not None:
             kind += f", genus {self.genus}"
@@ -151,6 +161,9 @@ def mesh_report(verts: Tensor, faces: Tensor) -> MeshReport:
     forward = directed_edges(sound)
     balance = np.bincount(number, np.sign(forward[:, 1] - forward[:, 0]), len(edges))
     boundary, crowded = int((faces_at == 1).sum()), int((faces_at > 2).sum())
+    place = np.unique(points, axis=0, return_inverse=True)[1].reshape(-1)
+    lone = place[edges[faces_at == 1]]
+    seam = _paired(lone)
     flipped = int(((faces_at == 2) & (balance != 0)).sum())
     touching = _touching(sound, len(points))
     closed = len(sound) > 0 and not (boundary or crowded or flipped)
@@ -168,12 +181,14 @@ def mesh_report(verts: Tensor, faces: Tensor) -> MeshReport:
         components=sizes,
         boundary_edges=boundary,
         boundary_loops=_loops(edges[faces_at == 1]),
+        seam_edges=int(seam.sum()),
+        holes=_loops(lone[~seam]),
         crowded_edges=crowded,
         touching_verts=touching,
         flipped_edges=flipped,
         degenerate_faces=degenerate,
         duplicate_faces=len(triangles) - len(np.unique(corners, axis=0)),
-        duplicate_verts=len(points) - len(np.unique(points, axis=0)),
+        duplicate_verts=len(points) - int(place.max()) - 1,
         unreferenced_verts=len(points) - len(np.unique(triangles)),
         euler=euler,
         genus=(2 - euler) // 2 if closed and not touching and len(sizes) == 1 else None,
@@ -193,6 +208,12 @@ def _parts(triangles: Indices, num_verts: int) -> tuple[int, ...]:
     label = components(directed_edges(triangles), num_verts)[triangles[:, 0]]
     sizes = np.unique(label, return_counts=True)[1]
     return tuple(sorted(sizes.tolist(), reverse=True))
+
+
+def _paired(edges: Indices) -> npt.NDArray[np.bool_]:
+    """(E,) which of the edges (E, 2) have the ends of another one, in either sense."""
+    _, number, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(count[number.reshape(-1)] > 1)
 
 
 def _loops(edges: Indices) -> int:

@@ -10,6 +10,7 @@ from meshkit.losses.chamfer import ChamferLoss, chamfer_loss
 from meshkit.losses.edge_length import EdgeLengthLoss, edge_length_loss
 from meshkit.losses.edge_ratio import EdgeRatioLoss, edge_ratio_loss
 from meshkit.losses.laplacian import LaplacianLoss, laplacian_loss
+from meshkit.losses.matching import MatchingLoss, matching_loss
 from meshkit.losses.normal_consistency import NormalConsistencyLoss, normal_consistency_loss
 from meshkit.losses.per_sample import ARAPEnergyLoss, SinkhornDivergenceLoss
 from meshkit.losses.reconstruction import ReconstructionLoss, reconstruction_loss
@@ -22,6 +23,7 @@ __all__ = [
     "EdgeLengthLoss",
     "EdgeRatioLoss",
     "LaplacianLoss",
+    "MatchingLoss",
     "NormalConsistencyLoss",
     "PlanLike",
     "ReconstructionLoss",
@@ -32,6 +34,7 @@ __all__ = [
     "edge_length_loss",
     "edge_ratio_loss",
     "laplacian_loss",
+    "matching_loss",
     "normal_consistency_loss",
     "reconstruction_loss",
     "sinkhorn_divergence",

@@ -71,6 +71,11 @@ class DensePlan:
         masses, index = (self._matrix if dim in (2, -1) else self._matrix.mT).topk(k, 2)
         return masses, torch.where(masses > 0, index, 0)
 
+    def log_at(self, columns: Tensor) -> Tensor:
+        """Logarithm of the entry at one column of each row, ``(B, N)``; -inf at negative columns."""
+        masses = self._matrix.gather(2, columns.clamp_min(0)[..., None])[..., 0]
+        return torch.where(columns < 0, -torch.inf, masses.log())
+
     def mutual(self) -> tuple[Tensor, Tensor]:
         """The heaviest column of each row, and whether that column prefers this row too."""
         best, back = self.argmax(2), self.argmax(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -117,7 +118,8 @@ class PoseTransferGenerator(nn.Module):
         super().__init__()
         if not eps > 0 or n_iters < 1 or k < 1:
             raise ValueError(f"eps, n_iters and k must be positive, got {eps}, {n_iters} and {k}")
-        if n_iters != int(n_iters) or k != int(k):
+        counts: tuple[Any, ...] = (n_iters, k)
+        if not all(isinstance(count, Integral) for count in counts):  # 5.0 would be refused only in the forward pass
             raise ValueError(f"n_iters and k must be whole numbers, got {n_iters} and {k}")
         if not widths or not extractor_widths or min(*widths, *extractor_widths) < 1:
             raise ValueError(f"widths must be positive, got {extractor_widths} and {widths}")

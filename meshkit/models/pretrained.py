@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import warnings
-from difflib import get_close_matches
 from importlib.resources import files
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from meshkit._names import did_you_mean, shipped_weights
 from meshkit.batching import bounding_box_center, center, check_mask
 from meshkit.descriptors import intrinsic_descriptors
 from meshkit.models.generator import PoseTransferGenerator
@@ -209,22 +209,14 @@ def pretrained_names() -> list[str]:
         >>> all(isinstance(name, str) for name in pretrained_names())
         True
     """
-    folder = files("meshkit") / "weights"
-    if not folder.is_dir():
-        return []
-    return sorted(entry.name.removesuffix(".safetensors") for entry in folder.iterdir() if _is_weights(entry.name))
-
-
-def _is_weights(name: str) -> bool:
-    return name.endswith(".safetensors")
+    return shipped_weights()
 
 
 def instead_of(name: str) -> str:
     """What to say after a name that no weights have: the nearest one, if one is near, and all there are."""
     names = pretrained_names()
-    near = get_close_matches(name.lower().replace("_", "-"), names, n=1)
-    there_are = f"here are {', '.join(names) or 'none'}"
-    return f": did you mean {near[0]}? T{there_are}" if near else f"; t{there_are}"
+    meant, there_are = did_you_mean(name, names), f"here are {', '.join(names) or 'none'}"
+    return f"{meant} T{there_are}" if meant else f"; t{there_are}"
 
 
 def read_card(name: str) -> dict[str, Any]:

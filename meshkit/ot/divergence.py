@@ -80,7 +80,7 @@ def sinkhorn_divergence(
 
     Returns:
         ``(B,)`` in units of the cost, differentiable in points and weights; 0 for a sample without any real point on
-        one side.
+        one side, not finite for one with a real point that is not.
 
     Raises:
         ValueError: as :func:`~meshkit.ot.sinkhorn`.
@@ -102,17 +102,16 @@ def sinkhorn_divergence(
     if not isinstance(eps, int | float):
         raise ValueError(f"eps must be a number, got {type(eps).__name__}; use anneal to lower it in steps")
 
-    read_options(eps, n_iters, tol, None, "unroll", domain, store)  # refuses what makes no sense
+    options = read_options(eps, n_iters, tol, None, "unroll", domain, store)
 
     def transport(first: Side, second: Side, dual: Literal["between", "within"]) -> Tensor:
-        schedule: float | list[float] = eps
-        if anneal is not None and domain != "kernel" and eps > 0:
+        own = options._replace(dual=dual)
+        if anneal is not None and domain != "kernel":
             start = _largest_cost(first, second, cost)
             schedule = eps_schedule(max(eps, start if start < math.inf else eps), eps, factor=anneal)[-n_iters:]
-        regularisation = schedule if isinstance(schedule, list) and len(schedule) > 1 else eps
-        options = read_options(regularisation, n_iters, tol, None, "unroll", domain, store)._replace(dual=dual)
+            own = own.through(schedule) if len(schedule) > 1 else own
         weights: dict[str, Any] = {"a": first.weights, "b": second.weights, "mask_x": first.mask, "mask_y": second.mask}
-        plan = solve_features(first.points, second.points, cost, options, **weights)
+        plan = solve_features(first.points, second.points, cost, own, **weights)
         if tol is not None and max(plan.n_iters) == n_iters:
             with torch.no_grad():
                 if bool((plan.read_samples(_violation) > tol).any()):

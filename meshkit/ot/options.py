@@ -46,6 +46,12 @@ class Options(NamedTuple):
         """Whether to store the kernels, of so many bytes in all."""
         return self.store == "keep" or (self.store == "auto" and size <= KEEP_BYTES)
 
+    def through(self, schedule: Sequence[float]) -> Options:
+        """The same, with eps falling through a schedule that ends at it and has ``n_iters`` values at most."""
+        steps = self.settings.n_iters - len(schedule)
+        scales = (*(schedule[-1] / eps for eps in schedule), *[1.0] * steps)
+        return self._replace(settings=self.settings._replace(scales=scales))
+
     def domain_for(self, spread: float, sides: Sides) -> str:
         """``"kernel"`` if logits that differ by ``spread`` leave all scalings within the range of the dtype."""
         if self.settings.scales:
@@ -66,7 +72,7 @@ def read_options(
         raise ValueError(f"n_iters must be an integer of at least 1, got {n_iters!r}")
     if tol is not None and not tol >= 0:
         raise ValueError(f"tol must be None or at least 0, got {tol!r}")
-    scales: tuple[float, ...] = ()
+    schedule: Sequence[float] = ()
     if isinstance(eps, str) or not isinstance(eps, int | float | Tensor | Sequence):
         raise ValueError(f"eps must be a number, a scalar tensor or a sequence of numbers, got {type(eps).__name__}")
     if isinstance(eps, Sequence):
@@ -78,10 +84,9 @@ def read_options(
         if domain == "kernel":
             raise ValueError('a sequence of eps needs domain="log" or "auto"')
         final = eps[-1]
-        scales = tuple(final / e if e > 0 else math.nan for e in (*eps, *[final] * (n_iters - len(eps))))
-        if math.nan in scales or not all(s > 0 for s in scales):
+        if not all(e > 0 and final / e > 0 for e in eps):
             raise ValueError(f"every eps must be positive, got {list(eps)}")
-        eps = final
+        schedule, eps = eps, final
     if isinstance(eps, Tensor) and eps.numel() != 1:
         raise ValueError(f"eps as a tensor must hold one value, got shape {tuple(eps.shape)}")
     value = float(eps.detach() if isinstance(eps, Tensor) else eps)
@@ -95,13 +100,14 @@ def read_options(
         if side is not None and not side > 0:
             raise ValueError(f"reach must be positive, or None for an exact marginal, got {reach!r}")
         powers.append(1.0 if side is None or side == math.inf else side / (side + value))
-    if scales and powers != [1.0, 1.0]:
+    if schedule and powers != [1.0, 1.0]:
         raise ValueError("reach cannot be combined with a sequence of eps")
     if isinstance(eps, Tensor) and eps.requires_grad and powers != [1.0, 1.0]:
         raise ValueError("reach cannot be combined with a learned eps: its power would need a gradient too")
     if isinstance(eps, Tensor):
         eps = (eps.detach() if grad == "none" else eps).reshape(())
-    return Options(eps, Settings(n_iters, tol, powers[0], powers[1], grad, scales), domain, store)
+    options = Options(eps, Settings(n_iters, tol, powers[0], powers[1], grad), domain, store)
+    return options.through(schedule) if schedule else options
 
 
 def plain(value: Any) -> Any:

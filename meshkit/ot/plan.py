@@ -185,8 +185,49 @@ class TransportPlan:
         local, index = self._heaviest(k, dim)
         over_rows = (dim in (2, -1)) != self._transposed
         with torch.autocast(self.device.type, enabled=False):
-            masses = [s.masses(near, over_rows) for s, near in zip(self._samples, local, strict=True)]
+            masses = [s.log_masses(near, over_rows).exp() for s, near in zip(self._samples, local, strict=True)]
         return self._spread([pad_columns(mass, k) for mass in masses], over_rows=over_rows), index
+
+    @uncompiled
+    def log_at(self, columns: Tensor) -> Tensor:
+        r"""Logarithm of one entry of each row, :math:`\log T_{i, c(i)}`, differentiable.
+
+        Args:
+            columns: int64 ``(B, N)``, the column c(i) of each row; negative where there is none.
+
+        Returns:
+            ``(B, N)``; -inf at negative columns, in padded columns, and for rows without mass.
+
+        Raises:
+            ValueError: another shape, or columns that are not integers.
+            IndexError: columns beyond M (on a CPU; on CUDA the device asserts).
+
+        Example:
+            >>> from meshkit.ot import sinkhorn
+            >>> plan = sinkhorn(torch.eye(3)[None], torch.eye(3)[None, [2, 0, 1]])
+            >>> plan.log_at(torch.tensor([[1, 2, -1]])).exp()  # a third each, the mass of a row
+            tensor([[0.3333, 0.3333, 0.0000]])
+        """
+        batch, rows, number = self.shape
+        if columns.shape != (batch, rows) or columns.dtype not in (torch.int64, torch.int32):
+            raise ValueError(
+                f"columns must be integers of shape (B, N) = {(batch, rows)}, got {columns.dtype} of "
+                f"{tuple(columns.shape)}"
+            )
+        columns = torch.where(columns < 0, number, columns).long()
+        found = []
+        with torch.autocast(self.device.type, enabled=False):
+            for sample, wanted in zip(self._samples, columns, strict=True):
+                own, other = (sample.index_x, sample.index_y)[:: -1 if self._transposed else 1]
+                near = wanted if own is None else wanted[own]
+                if other is not None:  # from the padded batch's columns to those that have weight
+                    local = torch.full((number + 1,), -1, device=self.device)
+                    local[other] = torch.arange(len(other), device=self.device)
+                    near = local[near]
+                none = (near < 0) | (near == number)
+                values = sample.log_masses(near.masked_fill(none, 0)[:, None], not self._transposed)[:, 0]
+                found.append(values.masked_fill(none, -torch.inf))
+        return self._spread(found, over_rows=not self._transposed, empty=-torch.inf)
 
     def _heaviest(self, k: int, dim: int) -> tuple[list[Tensor], Tensor]:
         """Positions among the rows (columns) that have weight, and in the padded batch."""

@@ -169,8 +169,8 @@ class SamplePlan:
             found = [b.argmax(1, keepdim=True) if k == 1 else b.topk(k, 1).indices for b in blocks]
             return torch.cat(found) if found else torch.empty(0, 0, dtype=torch.int64, device=scale.device)
 
-    def masses(self, near: Tensor, over_rows: bool) -> Tensor:
-        """Entries ``(N, k)`` at positions ``near`` of each row (or column)."""
+    def log_masses(self, near: Tensor, over_rows: bool) -> Tensor:
+        """Natural logarithms of the entries ``(N, k)`` at positions ``near`` of each row (or column)."""
         own = torch.arange(len(near), device=near.device)[:, None].expand_as(near)
         i, j = (own, near) if over_rows else (near, own)
         x, *rest = self.kernel.inputs
@@ -180,7 +180,7 @@ class SamplePlan:
             own_side, other_side = (x, rest[0]) if over_rows else (rest[0], x)
             logits = (own_side[:, None] * other_side[near]).sum(2)
         log_a, log_b = self.logarithms()
-        return (logits / LOG2_E + log_a[i] + log_b[j]).exp()
+        return logits / LOG2_E + log_a[i] + log_b[j]
 
 
 def pad_columns(values: Tensor, size: int) -> Tensor:

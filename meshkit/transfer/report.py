@@ -111,10 +111,10 @@ class TransferReport:
             lines += [f"UNUSUAL  {self._in_words(doubt)}" for doubt in self.doubts if not doubt.follows]
             if more := following(self.doubts):
                 lines.append(f"         {more}")
-        elif self.calibrated:
-            lines.append("         all within what is usual for the weights' own test pairs")
-        else:
+        if not self.calibrated:
             lines.append("         these weights do not say what is usual")
+        elif not self.doubts:
+            lines.append("         all within what is usual for the weights' own test pairs")
         return "\n".join(lines)
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from meshkit.io import MeshFileError, SurfaceBinding
+from meshkit.io._arrays import read_arrays
 from meshkit.io._glb import read_scene
 from meshkit.io.report import counted
 from meshkit.transfer._choose import Weights
@@ -93,13 +94,10 @@ def _natural(name: str) -> list[Any]:
 
 def _npz_meshes(path: Path) -> list[tuple[Tensor, Tensor]]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            # The sizes of the arrays, not of the compressed file: a small file can unpack to anything.
-            wanted = [entry for entry in archive.zip.infolist() if entry.filename in ("verts.npy", "faces.npy")]
-            if (size := sum(entry.file_size for entry in wanted)) > _MAX_BYTES:
-                raise ValueError(f"{size:,} bytes of poses, more than the {_MAX_BYTES:,} allowed")
-            arrays = {name: archive[name] for name in ("verts", "faces")}
-    except Exception as error:  # zipfile, zlib, KeyError and ValueError, depending on the damage
+        arrays = read_arrays(path, ("verts", "faces"), _MAX_BYTES, limit="")
+        if missing := [name for name in ("verts", "faces") if name not in arrays]:
+            raise ValueError(f"there is no {' and no '.join(missing)}")
+    except ValueError as error:
         raise MeshFileError(f"{path}: not an .npz file with arrays verts and faces ({error})") from error
     verts, faces = arrays["verts"], arrays["faces"]
     good = verts.ndim == 3 and verts.shape[0] > 0 and verts.shape[2] == 3 and verts.dtype.kind == "f"
