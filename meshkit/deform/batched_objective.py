@@ -7,6 +7,7 @@ from torch import Tensor
 
 from meshkit.deform.batched_factor import BatchedFactor
 from meshkit.deform.batched_rotation import Differential
+from meshkit.deform.conjugate_gradients import conjugate_gradients_batch
 from meshkit.deform.objective import Objective
 from meshkit.deform.sparse import linear
 
@@ -48,6 +49,11 @@ class BatchedObjective(Objective):
     def solve(self, right: Tensor) -> Tensor:
         """Apply the inverse of the stiffness of the free vertices; 0 at the others, whatever `right` is there."""
         return self._solve(right)
+
+    def solve_hessian(self, product: Callable[[Tensor], Tensor], right: Tensor, *, tol: float) -> tuple[Tensor, Tensor]:
+        """Solve H x = b for the free vertices, given H; and for which meshes (B,) it is not positive."""
+        settings: dict[str, Any] = {"tol": tol, "max_iter": 500, "look": self.look}
+        return conjugate_gradients_batch(product, self.solve, right, dot=self.dot, spread=self.spread, **settings)
 
     def dot(self, a: Tensor, b: Tensor) -> Tensor:
         """Inner product (B,) of vectors, for each mesh."""

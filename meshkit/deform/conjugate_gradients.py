@@ -1,34 +1,68 @@
-"""Conjugate gradients for several systems at once."""
+"""Conjugate gradients: for one system, whose end the host sees at once, and for several, each with its own steps.
+
+They are here twice for the reason that L-BFGS is: see the module ``lbfgs``.
+"""
 
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-__all__ = ["conjugate_gradients"]
+__all__ = ["conjugate_gradients", "conjugate_gradients_batch"]
+
+Map = Callable[[Tensor], Tensor]
+Product = Callable[[Tensor, Tensor], Tensor]
 
 
 def conjugate_gradients(
-    product: Callable[[Tensor], Tensor],
-    precondition: Callable[[Tensor], Tensor],
+    product: Map, precondition: Map, right: Tensor, *, dot: Product, tol: float, max_iter: int
+) -> tuple[Tensor, bool]:
+    """Solve A x = b, and tell whether a direction p with p^T A p <= 0 ended it.
+
+    Args:
+        product: A, symmetric.
+        precondition: symmetric positive, but for rows that it ignores and gives 0; makes a new tensor.
+        right: (N, D) right-hand side b; what the preconditioner gives 0 is not solved for.
+        dot: inner product of vectors (N, D).
+        tol: relative accuracy, in the norm of the preconditioner.
+        max_iter: iterations at most.
+    """
+    solution, residual = torch.zeros_like(right), right.clone()
+    direction = precondition(residual)
+    square = first = float(dot(residual, direction))
+    for iteration in range(max_iter):
+        if square <= tol * tol * first:
+            break
+        image = product(direction)
+        curvature = float(dot(direction, image))
+        if curvature <= 0:  # the preconditioner's step is better than none
+            return (solution if iteration else direction), True
+        step = square / curvature
+        solution.add_(direction, alpha=step)
+        residual.sub_(image, alpha=step)
+        scaled = precondition(residual)
+        before, square = square, float(dot(residual, scaled))
+        direction = scaled.add_(direction, alpha=square / before)
+    return solution, False
+
+
+def conjugate_gradients_batch(
+    product: Map,
+    precondition: Map,
     right: Tensor,
     *,
-    dot: Callable[[Tensor, Tensor], Tensor],
-    spread: Callable[[Tensor], Tensor],
+    dot: Product,
+    spread: Map,
     tol: float,
     max_iter: int,
     look: int,
 ) -> tuple[Tensor, Tensor]:
-    """Solve A x = b for every system, and tell which met a direction p with p^T A p <= 0 and ended there.
+    """Solve several systems at once, and tell which met a direction p with p^T A p <= 0 and ended there.
 
     Args:
-        product: A, symmetric.
-        precondition: symmetric positive, but for rows that it ignores and gives 0.
-        right: (N, D) the right-hand sides b; what the preconditioner gives 0 is not solved for.
+        product, precondition, right, tol, max_iter: see :func:`conjugate_gradients`.
         dot: one number per system from two vectors (N, D).
         spread: of numbers per system what broadcasts with (N, D).
-        tol: relative accuracy, in the norm of the preconditioner.
-        max_iter: iterations at most.
         look: iterations between two looks at what is done, each of which waits for the device.
     """
     solution, residual = torch.zeros_like(right), right
@@ -56,24 +90,36 @@ def conjugate_gradients(
     return solution, negative
 
 
-def column_solver(matrix: Tensor, inverse: Tensor, *, batch: int, look: int = 16) -> Callable[[Tensor], Tensor]:
+def diagonal_solver(matrix: Tensor, inverse: Tensor) -> Map:
+    """Solver of sparse A x = b (N, 3) to 1e-10 of b, with the inverse (N, 1) of the diagonal as preconditioner."""
+
+    def dot(a: Tensor, b: Tensor) -> Tensor:
+        return torch.dot(a.view(-1), b.view(-1))
+
+    def solve(right: Tensor) -> Tensor:
+        return conjugate_gradients(matrix.matmul, inverse.mul, right, dot=dot, tol=1e-10, max_iter=10 * len(right))[0]
+
+    return solve
+
+
+def column_solver(matrix: Tensor, inverse: Tensor, *, batch: int, look: int = 16) -> Map:
     """Solver of sparse A x = b (N, 3), N over a batch of blocks, to 1e-10 of b; every column takes its own steps.
 
     Args:
         matrix: (N, N) symmetric and positive on what it is asked for.
         inverse: (N, 1) of the diagonal; 0 where there is nothing to solve for.
         batch: number of blocks of equal size.
-        look: see :func:`conjugate_gradients`.
+        look: see :func:`conjugate_gradients_batch`.
     """
     size = len(matrix) // batch
 
     def solve(right: Tensor) -> Tensor:
-        return conjugate_gradients(
+        return conjugate_gradients_batch(
             matrix.matmul,
             inverse.mul,
             right,
             dot=lambda a, b: (a * b).view(batch, size, 3).sum(1),
-            spread=lambda values: values if batch == 1 else values.repeat_interleave(size, 0),
+            spread=lambda values: values.repeat_interleave(size, 0),
             tol=1e-10,
             max_iter=10 * size,
             look=look,

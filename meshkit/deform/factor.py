@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from meshkit.deform.conjugate_gradients import column_solver
+from meshkit.deform.conjugate_gradients import diagonal_solver
 from meshkit.deform.rest import ARAPRest
 from meshkit.deform.sparse import csr_of_scipy
 
@@ -179,7 +179,7 @@ def _cholespy(matrix: Any) -> Callable[[Any], Any]:
 
 def _pcg(matrix: Any) -> Callable[[Any], Any]:
     inverse = torch.from_numpy(1 / matrix.diagonal()[:, None])
-    solve = column_solver(csr_of_scipy(matrix.tocsr()), inverse, batch=1)
+    solve = diagonal_solver(csr_of_scipy(matrix.tocsr()), inverse)
     return lambda right: solve(torch.from_numpy(right)).numpy()
 
 

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from meshkit.deform.conjugate_gradients import conjugate_gradients
 from meshkit.deform.objective import Objective
 from meshkit.deform.options import ARAPInfo, Options, warn_unconverged
 
@@ -57,15 +56,8 @@ class ImplicitMinimum(torch.autograd.Function):
         def product(direction: Tensor, change: Tensor) -> Tensor:
             return objective.stiffness @ direction - objective.pulled_back(change)
 
-        adjoint, negative = conjugate_gradients(
-            lambda direction: product(direction, turned(direction)),
-            objective.solve,
-            grad,
-            dot=objective.dot,
-            spread=objective.spread,
-            tol=ctx.options.grad_tol,
-            max_iter=500,
-            look=objective.look,
+        adjoint, negative = objective.solve_hessian(
+            lambda direction: product(direction, turned(direction)), grad, tol=ctx.options.grad_tol
         )
         ctx.info.negative_curvature.logical_or_(negative)
         if bool(negative.any()):

@@ -91,8 +91,8 @@ def minimise(
     ended = residual <= tol
     if history:
         residual = objective.residual(energy, gradient)
-    evaluations = torch.tensor([objective.evaluations], device="cpu")
-    return x, objective.info(energy, evaluations, residual, ended, torch.tensor([negative], device="cpu"))
+    evaluations = torch.tensor(objective.evaluations, device="cpu")
+    return x, objective.info(energy, evaluations, residual, ended, torch.tensor(negative, device="cpu"))
 
 
 def minimise_batch(objective: BatchedObjective, x: Tensor, *, max_iter: int, tol: float) -> tuple[Tensor, ARAPInfo]:

@@ -132,11 +132,11 @@ class MeshByMesh(Problem):
         with torch.set_grad_enabled(torch.is_grad_enabled() and options.grad != "none"):
             for b in range(self.batch):
                 soft = [None if values is None else values[b] for values in (soft_targets, soft_weights, start)]
-                moved, info = self._deform_one(b, handles[0][b], goal[b], options, soft, negative[b : b + 1])
+                moved, info = self._deform_one(b, handles[0][b], goal[b], options, soft, negative[b])
                 results.append(moved.new_zeros(self.size, 3).index_copy(0, self.real[b], moved))
                 infos.append(info)
             deformed = torch.stack(results).view(self.shape).to(self.device, self.dtype)
-        joined = {field.name: torch.cat([getattr(info, field.name) for info in infos]) for field in fields(ARAPInfo)}
+        joined = {field.name: torch.stack([getattr(info, field.name) for info in infos]) for field in fields(ARAPInfo)}
         # The backward pass writes into this one.
         return deformed, self.report(ARAPInfo(**joined | {"negative_curvature": negative}))
 
@@ -149,7 +149,7 @@ class MeshByMesh(Problem):
         soft: list[Tensor | None],
         negative: Tensor,
     ) -> tuple[Tensor, ARAPInfo]:
-        """Positions (n, 3) of one mesh, given its soft targets, soft weights and start; and its report (1,)."""
+        """Positions (n, 3) of one mesh, given its soft targets, soft weights and start; and its report ()."""
         rest, (soft_targets, soft_weights, start) = self.rests[b], soft
         factor = ARAPFactor(rest, handles, soft_weights=soft_weights, solver=options.solver)
         if not len(factor.free):

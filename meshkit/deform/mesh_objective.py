@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from meshkit.deform.conjugate_gradients import conjugate_gradients
 from meshkit.deform.factor import ARAPFactor
 from meshkit.deform.objective import Objective
 from meshkit.deform.options import ARAPInfo
@@ -23,8 +24,6 @@ class MeshObjective(Objective):
     come.
     """
 
-    look = 1
-
     def __init__(
         self, factor: ARAPFactor, soft_targets: Tensor | None, *, dtype: torch.dtype, compiled: bool = False
     ) -> None:
@@ -37,10 +36,8 @@ class MeshObjective(Objective):
         self.scale = rest.rest_energy / rest.topology.multiplicity / max(cells, 1) or 1.0
         # On the CPU torch's products with three columns are twice as fast as scipy's.
         self.moments, self.moments_t = csr_of_scipy(rest.moments, 1 / self.scale), csr_of_scipy(rest.moments_t)
-        count = len(factor.free)
-        self._place = torch.full((size,), count, dtype=torch.int32, device="cpu")
-        self._place[factor.free] = torch.arange(count, dtype=torch.int32, device="cpu")
-        self.free = (self._place < count)[:, None]
+        self.free = torch.zeros(size, 1, dtype=torch.bool, device="cpu")
+        self.free[factor.free] = True
         soft = None if factor.soft is None else factor.soft[:, None]
         super().__init__(rest, csr_of_scipy(factor.stiffness), soft, soft_targets)
 
@@ -98,14 +95,20 @@ class MeshObjective(Objective):
 
     def solve(self, right: Tensor) -> Tensor:
         """Apply the inverse of the stiffness of the free vertices; 0 at the others."""
-        solved = self.factor.solve(right.index_select(0, self.factor.free).numpy())
-        padded = torch.cat([torch.from_numpy(solved), right.new_zeros(1, 3)])
-        return padded.index_select(0, self._place)
+        free = self.factor.free
+        solved = self.factor.solve(right.index_select(0, free).numpy())
+        # Unlike a copy to rows of a slice, this one is not slow where the factor gives columns.
+        return torch.zeros_like(right).index_copy_(0, free, torch.from_numpy(solved))
+
+    def solve_hessian(self, product: Callable[[Tensor], Tensor], right: Tensor, *, tol: float) -> tuple[Tensor, Tensor]:
+        """Solve H x = b for the free vertices, given H; and whether it is not positive."""
+        solution, negative = conjugate_gradients(product, self.solve, right, dot=self.dot, tol=tol, max_iter=500)
+        return solution, torch.tensor(negative, device="cpu")
 
     def dot(self, a: Tensor, b: Tensor) -> Tensor:
-        """Inner product (1,) of vectors."""
-        return torch.dot(a.view(-1), b.view(-1))[None]
+        """Inner product () of vectors."""
+        return torch.dot(a.view(-1), b.view(-1))
 
     def spread(self, values: Tensor) -> Tensor:
-        """The value as (1, 1)."""
-        return values[:, None]
+        """The value, which broadcasts as it is."""
+        return values

@@ -18,9 +18,9 @@ class Objective(ABC):
     r"""Energy over m and half its gradient, :math:`g = (L + W) x - B^\top R(x) - W t`, W the soft weights.
 
     Of one mesh, or of a batch whose vertices and cells are numbered through, V and K in all. Positions and sums are
-    float64, about the origins of the rest shapes; vectors are (V, 3), and what there is per mesh is (B,). How the
-    matrices of the cells are stored, and how their rotations are found, is up to the subclass: long rows and a search
-    from the last rotations on the CPU, batched products without a branch on a GPU.
+    float64, about the origins of the rest shapes; vectors are (V, 3), and what there is per mesh is (B,), or () for one
+    mesh. How the matrices of the cells are stored, and how their rotations are found, is up to the subclass: long rows
+    and a search from the last rotations on the CPU, batched products without a branch on a GPU.
 
     Args:
         rest: the rest shapes.
@@ -33,12 +33,10 @@ class Objective(ABC):
         constant: (B,) what the energy holds beside its terms in x.
         image: (L + W) x of the last evaluation.
         floor: share of the constant that a residual is relative to where the energy is less.
-        look: iterations between two looks at what is done.
     """
 
     free: Tensor
     floor: float
-    look: int
 
     def __init__(
         self, rest: ARAPRest | BatchedRest, stiffness: Tensor, soft: Tensor | None, soft_targets: Tensor | None
@@ -74,6 +72,10 @@ class Objective(ABC):
     @abstractmethod
     def solve(self, right: Tensor) -> Tensor:
         """Apply the inverse of the stiffness of the free vertices; 0 at the others, whatever `right` is there."""
+
+    @abstractmethod
+    def solve_hessian(self, product: Callable[[Tensor], Tensor], right: Tensor, *, tol: float) -> tuple[Tensor, Tensor]:
+        """Solve H x = b for the free vertices, given H; and for which meshes (B,) it is not positive."""
 
     @abstractmethod
     def dot(self, a: Tensor, b: Tensor) -> Tensor:

@@ -43,5 +43,7 @@ class _Linear(torch.autograd.Function):
 
 def linear(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
     """Apply a linear map given together with its adjoint: a factor, or a matrix and its transpose."""
+    if not (x.requires_grad and torch.is_grad_enabled()):
+        return apply(x)
     result: Tensor = _Linear.apply(x, apply, adjoint)
     return result
