@@ -21,8 +21,9 @@ import torch
 
 from meshkit.data import load_humans
 from meshkit.deform import ARAPFactor, ARAPRest, ARAPTopology, arap_deform, arap_energy
-from meshkit.deform.objective import Objective, minimise
-from meshkit.deform.rest import stationarity_gradient
+from meshkit.deform.lbfgs import minimise
+from meshkit.deform.local_global import alternate
+from meshkit.deform.mesh_objective import MeshObjective
 
 
 def body(vertices):
@@ -64,13 +65,16 @@ class Case:
         self.factor = ARAPFactor(self.rest, self.handles)
 
     def solve(self, max_iter, tol, compiled=False):
-        objective = Objective(self.factor, None, dtype=torch.float32, compiled=compiled)
-        x = self.rest.verts.clone()
-        x[self.handles] = self.goal - self.rest.origin
-        x = objective.global_step(x)
+        objective = MeshObjective(self.factor, None, dtype=torch.float32, compiled=compiled)
         objective.start_from_rest()
-        outcome = minimise(objective, x, max_iter=max_iter, tol=tol, refine=False)
-        return outcome.x + self.rest.origin, outcome.evaluations
+        x, info = minimise(objective, self.start(objective), max_iter=max_iter, tol=tol, refine=False)
+        return x + self.rest.origin, int(info.evaluations)
+
+    def start(self, objective):
+        """Positions that suit the rotations of the rest shape."""
+        goal = torch.zeros_like(self.rest.verts)
+        goal[self.handles] = self.goal - self.rest.origin
+        return alternate(objective, goal, None, max_iter=1, tol=0.0)[0]
 
     def igl_set_up(self):
         import igl
@@ -173,7 +177,11 @@ def gradients(case, posed, args):
     held = upstream - torch.from_numpy(case.rest.laplacian @ adjoint.numpy())
     rotations = case.rest.rotations(x - case.rest.origin).permute(2, 1, 0).contiguous()
     change = torch.zeros_like(rotations)
-    fixed = held[case.handles], -stationarity_gradient(case.rest, x, adjoint, rotations, change)
+    edges, centred = case.rest.edges, x - case.rest.origin
+    fixed = (
+        held[case.handles],
+        -edges.stationarity_gradient(case.rest.verts, centred, adjoint, rotations, change),
+    )
 
     def errors(candidate):
         pairs = zip(("handles", "rest"), candidate, exact, strict=True)
@@ -215,7 +223,7 @@ def differences(case, wave, x, exact):
         print(f"  differences, {name}: {slope:.8e} against {predicted:.8e}, relative {abs(predicted / slope - 1):.1e}")
 
 
-class Recorder(Objective):
+class Recorder(MeshObjective):
     """Remembers the lowest energy after every evaluation."""
 
     def __init__(self, *args, **kwargs):
@@ -224,25 +232,24 @@ class Recorder(Objective):
 
     def __call__(self, x):
         energy, gradient = super().__call__(x)
-        self.energies.append(min([energy, *self.energies[-1:]]))
+        self.energies.append(min([float(energy), *self.energies[-1:]]))
         return energy, gradient
 
 
 def curves(case, count=100):
     """Energies over m after each L-BFGS evaluation, and after each local-global iteration."""
-    start = case.rest.verts.clone()
-    start[case.handles] = case.goal - case.rest.origin
     fast = Recorder(case.factor, None, dtype=torch.float32)
-    x = first = fast.global_step(start)
     fast.start_from_rest()
-    minimise(fast, x, max_iter=count, tol=0.0, refine=False)
+    first = case.start(fast)
+    minimise(fast, first, max_iter=count, tol=0.0, refine=False)
     slow = Recorder(case.factor, None, dtype=torch.float64)
     x = first
     for _ in range(count):
         _, gradient = slow(x)
-        x = x - slow.spread(slow.solve(gradient))  # with the rotations held: one global step
+        x = x - slow.solve(gradient)  # with the rotations held: one global step
     exact = Recorder(case.factor, None, dtype=torch.float64)
-    lowest = minimise(exact, first, max_iter=3000, tol=1e-12, refine=False).energy
+    minimise(exact, first, max_iter=3000, tol=1e-12, refine=False)
+    lowest = exact.energies[-1]
     return fast.energies, slow.energies, lowest
 
 

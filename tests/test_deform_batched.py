@@ -8,11 +8,12 @@ from conftest import rand
 
 from meshkit.data import load_humans
 from meshkit.deform import ARAPDeformer, ARAPInfo, arap_deform, arap_energy, closest_rotation
-from meshkit.deform.batched import BatchedEnergy
 from meshkit.deform.batched_factor import BatchedFactor
-from meshkit.deform.batched_objective import BatchedObjective, alternate_batch
+from meshkit.deform.batched_objective import BatchedObjective
+from meshkit.deform.batched_rest import BatchedRest
 from meshkit.deform.batched_rotation import BatchedRotation
-from meshkit.deform.energy import energy_of_batch
+from meshkit.deform.local_global import alternate
+from meshkit.deform.whole_batch import WholeBatch
 from meshkit.topology import connected_components, cotangent_laplacian
 
 ENERGIES = ["spokes_and_rims", "spokes", "spokes_unclamped", "elements"]
@@ -99,13 +100,13 @@ def test_ill_determined_rotations_maximise_and_zero_is_the_identity(device: str)
 @ON_DEVICES
 def test_operators_of_a_ragged_batch(device: str) -> None:
     verts, faces, _, _, mask = (value.to(device) for value in ragged())
-    energy = BatchedEnergy(verts, faces, mask, "spokes_and_rims")
+    energy = BatchedRest(verts, faces, mask, "spokes_and_rims")
     labels = energy.components.view(3, 40).cpu()
     for b in range(3):
         own = connected_components(faces[b].cpu(), 40)
         assert torch.equal(labels[b][:, None] == labels[b], own[:, None] == own)
         rest = torch.where(mask[b, :, None], verts[b] - energy.origin[b], 0.0).cpu()
-        torch.testing.assert_close(energy.rest[b].cpu(), rest)
+        torch.testing.assert_close(energy.verts.view(3, 40, 3)[b].cpu(), rest)
         dense = torch.zeros(40, 40).double()
         inside = energy.rows // 40 == b
         dense[(energy.rows % 40)[inside].cpu(), (energy.cols % 40)[inside].cpu()] = energy.values[inside].cpu()
@@ -116,14 +117,14 @@ def test_operators_of_a_ragged_batch(device: str) -> None:
 @pytest.mark.parametrize("solver", ["dense", "pcg"])
 def test_factor_solves(device: str, solver: str) -> None:
     verts, faces, _, _, mask = (value.to(device) for value in ragged())
-    energy = BatchedEnergy(verts, faces, mask, "spokes_and_rims")
+    energy = BatchedRest(verts, faces, mask, "spokes_and_rims")
     free = mask & (torch.arange(40, device=device) % 6 > 0)
     soft = rand(3, 40, seed=3).abs().to(device) * mask
     right = torch.where(free[..., None], rand(3, 40, 3).to(device), 0.0)
     got = BatchedFactor(energy, free, soft, solver).solve(right.view(-1, 3)).view(3, 40, 3).cpu()
     for b in range(3):
         own = free[b].cpu()
-        rest = energy.rest[b].cpu()
+        rest = energy.verts.view(3, 40, 3)[b].cpu()
         matrix = cotangent_laplacian(rest, faces[b].cpu()).to_dense() + torch.diag(soft[b].cpu())
         expected = torch.linalg.solve(matrix[own][:, own], right[b].cpu()[own])
         torch.testing.assert_close(got[b][own], expected, rtol=1e-8, atol=1e-8)
@@ -136,16 +137,19 @@ def test_energy_and_its_gradients(device: str, energy: str) -> None:
     verts, faces, _, _, mask = ragged()
     deformed = verts + 0.2 * rand(*verts.shape, seed=8)
     results = []
-    for place, function in (("cpu", arap_energy), (device, energy_of_batch)):
+    for place, whole in (("cpu", False), (device, True)):
         leaves = [value.clone().to(place).requires_grad_() for value in (verts, deformed)]
-        options: dict[str, Any] = {"energy": energy, "mask": mask.to(place), "degenerate": "raise"}
-        values = function(leaves[0], faces.to(place), leaves[1], **options)
+        own = faces.to(place), mask.to(place)
+        if whole:
+            values = WholeBatch(leaves[0], *own, energy, "raise").energies(leaves[1])
+            assert values is not None
+        else:
+            values = arap_energy(leaves[0], own[0], leaves[1], energy=energy, mask=own[1], degenerate="raise")
         (values * rand(3, seed=1).to(place)).sum().backward()
         results.append([value.cpu() for value in (values, *(leaf.grad for leaf in leaves))])
     for got, expected in zip(results[1], results[0], strict=True):
         torch.testing.assert_close(got, expected, rtol=1e-8, atol=1e-9)
-    assert energy_of_batch(verts, faces, deformed[:, 1:], **options) is None
-    assert energy_of_batch(verts, faces, deformed, **options | {"mask": None}) is None  # NaN in the padding
+    assert WholeBatch(verts, faces, None, energy, "raise").energies(deformed) is None  # NaN in the padding
 
 
 # ---------------------------------------------------------------- deformation
@@ -248,6 +252,19 @@ def test_a_saddle_is_reported(device: str) -> None:
 
 
 @ON_DEVICES
+@pytest.mark.parametrize("solver", ["splu", "dense"])
+def test_a_saddle_is_reported_for_its_mesh(device: str, solver: str) -> None:
+    verts, faces = (value.to(device) for value in grid(5, seed=0))
+    handles = torch.tensor([0, 4, 20, 24], device=device)
+    pos = torch.stack([1.01 * verts[handles], -1.5 * verts[handles]]).requires_grad_()
+    x, info = arap_deform(verts.expand(2, -1, 3), faces, handles, pos, max_iter=1, solver=solver)
+    assert info.negative_curvature.tolist() == [False, False]
+    with pytest.warns(UserWarning, match="negative curvature: the deformation is a saddle"):
+        x.square().sum().backward()
+    assert info.negative_curvature.tolist() == [False, True]
+
+
+@ON_DEVICES
 def test_bad_input_is_described_by_the_other_path(device: str) -> None:
     verts, faces = (value.to(device) for value in grid(4, seed=0))
     good = {"verts": verts, "faces": faces, "handles": torch.tensor([0, 7]).to(device), "handle_pos": verts[[0, 7]]}
@@ -269,6 +286,7 @@ def test_bad_input_is_described_by_the_other_path(device: str) -> None:
         ({"verts": nan}, "verts holds NaN"),
         ({"verts": flat}, "faces have an edge of length zero"),
         ({"verts": verts.long()}, "verts must be a floating"),
+        ({"verts": verts.expand(0, -1, 3)}, r"verts \(0, 16, 3\) holds no vertex"),
         ({"verts": verts[None], "faces": faces.expand(2, -1, 3)}, "differ in batch size"),
         ({"faces": faces + 1}, r"face indices must lie in \[0, 16\)"),
         ({"handles": torch.tensor([0, 16])}, r"handles must lie in \[0, 16\)"),
@@ -348,13 +366,13 @@ def test_iterations_do_not_wait_for_the_device() -> None:
     rig = load_humans(1000)
     rest, faces = rig.shape(torch.arange(4))[0].cuda(), rig.faces.cuda().expand(4, -1, 3)
     target = rig(torch.arange(4), torch.arange(4)).cuda().requires_grad_()
-    energy = BatchedEnergy(rest, faces, torch.ones(4, 1000, dtype=torch.bool, device="cuda"), "spokes_and_rims")
+    energy = BatchedRest(rest, faces, torch.ones(4, 1000, dtype=torch.bool, device="cuda"), "spokes_and_rims")
     fixed = (torch.arange(1000, device="cuda") % 10 == 0).expand(4, -1)
     objective = BatchedObjective(BatchedFactor(energy, ~fixed, None, "dense"), None)
 
     def run() -> torch.Tensor:
         goal = torch.where(fixed[..., None], target.double() - energy.origin, 0.0).flatten(0, 1)
-        x, _ = alternate_batch(objective, goal, None, max_iter=3, tol=0.0)
+        x, _ = alternate(objective, goal, None, max_iter=3, tol=0.0)
         return torch.autograd.grad(x.square().sum(), target)[0]
 
     run()  # constants are copied to the device once

@@ -19,7 +19,7 @@ from meshkit.deform import (
     arap_deform,
     arap_energy,
 )
-from meshkit.deform.objective import Objective
+from meshkit.deform.mesh_objective import MeshObjective
 
 ENERGIES = ["spokes_and_rims", "spokes", "spokes_unclamped", "elements"]
 TIGHT: dict[str, Any] = {"tol": 1e-20, "max_iter": 3000, "grad_tol": 1e-10}
@@ -402,6 +402,6 @@ def test_factor_and_rest_check_their_own_input() -> None:
 def test_memory_is_linear() -> None:
     verts, faces = ellipsoid(3)
     rest = ARAPRest(ARAPTopology(faces, len(verts)), verts)
-    objective = Objective(ARAPFactor(rest, torch.arange(0, len(verts), 9)), None, dtype=torch.float32)
+    objective = MeshObjective(ARAPFactor(rest, torch.arange(0, len(verts), 9)), None, dtype=torch.float32)
     kept = [value for value in vars(objective).values() if isinstance(value, torch.Tensor)]
     assert sum(t.values().numel() if t.layout == torch.sparse_csr else t.numel() for t in kept) < 80 * len(verts)

@@ -7,10 +7,8 @@ from typing import Any
 from torch import Tensor
 
 from meshkit._compile import uncompiled
-from meshkit.deform.batched_deform import BatchedProblem
+from meshkit.deform.dispatch import Kind, dispatch
 from meshkit.deform.options import ARAPInfo, Options, check_options, refuse_partial_gradient
-from meshkit.deform.problem import Problem
-from meshkit.deform.single import deform_each
 from meshkit.deform.topology import check_energy
 
 __all__ = ["PRESETS", "arap_deform"]
@@ -133,48 +131,17 @@ def arap_deform(
     if grad == "unroll":
         refuse_partial_gradient(verts=verts, soft_weights=soft_weights)
     options = Options(method, max_iter, tol, grad, grad_tol, solver, compiled)
-    if options.batched(verts.device) and BatchedProblem.possible(verts, faces, mask):
-        whole = BatchedProblem(verts, faces, mask, energy, degenerate)
-        result = _deform_batch(whole, handles, handle_pos, soft_targets, soft_weights, init, options)
-        if result is not None:
-            return result
-    # One by one; also to say what is wrong with input that the whole batch could not be solved for.
-    problem = Problem(verts, faces, mask, energy, degenerate)
-    own, used = problem.handles(handles, needed=soft_weights is None)
-    none: list[Any] = [None] * problem.batch
-    soft_t = none if soft_targets is None else problem.split(soft_targets, "soft_targets")
-    soft_w = none if soft_weights is None else problem.split_weights(soft_weights, "soft_weights")
-    starts = none if isinstance(init, str) else problem.split(init, "init")
-    return deform_each(problem, own, problem.targets(handle_pos, used), soft_t, soft_w, starts, options)
 
+    def work(kind: Kind) -> tuple[Tensor, ARAPInfo] | None:
+        problem: Any = kind(verts, faces, mask, energy, degenerate)
+        chosen = problem.handles(handles)
+        return problem.deform(
+            chosen,
+            problem.goal(chosen, handle_pos),
+            options,
+            None if soft_targets is None else problem.positions(soft_targets, "soft_targets"),
+            None if soft_weights is None else problem.weights(soft_weights, "soft_weights"),
+            None if isinstance(init, str) else problem.positions(init, "init"),
+        )
 
-def _deform_batch(
-    problem: BatchedProblem,
-    handles: Tensor,
-    handle_pos: Tensor,
-    soft_targets: Tensor | None,
-    soft_weights: Tensor | None,
-    init: str | Tensor,
-    options: Options,
-) -> tuple[Tensor, ARAPInfo] | None:
-    """Deform all meshes at once, or return None where the input is not fit for it."""
-    given = [value for value in (soft_targets, init) if isinstance(value, Tensor)]
-    if any(value.shape != problem.shape for value in given):
-        return None
-    chosen = problem.handles(handles)
-    goal = None if chosen is None else problem.goal(*chosen, handle_pos)
-    if chosen is None or goal is None:
-        return None
-    weights = None
-    if soft_weights is not None:
-        if tuple(soft_weights.shape) not in (tuple(problem.shape[:-1]), (problem.size,)):
-            return None
-        weights = soft_weights.to(problem.device).double().expand(problem.batch, problem.size)
-    return problem.deform(
-        chosen[0],
-        goal,
-        options,
-        soft_targets=None if soft_targets is None else problem.positions(soft_targets),
-        soft_weights=weights,
-        start=problem.positions(init) if isinstance(init, Tensor) else None,
-    )
+    return dispatch(options.batched(verts.device), work)

@@ -1,14 +1,14 @@
 """The ARAP deformer of X-DualNet: bend a mesh until a few random vertices meet a target."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 from meshkit._compile import uncompiled
 from meshkit._repr import settings
-from meshkit.deform.batched_deform import BatchedProblem
+from meshkit.deform.dispatch import Kind, dispatch
 from meshkit.deform.options import ARAPInfo, Options, check_options, refuse_partial_gradient
-from meshkit.deform.problem import Problem
-from meshkit.deform.single import deform_each
 from meshkit.deform.topology import check_energy
 
 __all__ = ["ARAPDeformer"]
@@ -125,60 +125,18 @@ class ARAPDeformer(nn.Module):
         handles: Tensor | None,
         generator: torch.Generator | None,
     ) -> tuple[Tensor, ARAPInfo]:
-        if self.options.batched(rest.device):
-            result = self._deform_batch(rest, target, faces, mask, handles, generator or self.generator)
-            if result is not None:
-                return result
-        problem = Problem(rest, faces, mask, self.energy, self.degenerate)
-        goals = problem.split(target, "target")
-        if handles is None:
-            own = random_handles(problem, self.fraction, generator or self.generator)
-        else:
-            own, _ = problem.handles(handles, needed=True)
-        none = [None] * problem.batch
-        targets = [goal[index] for goal, index in zip(goals, own, strict=True)]
-        return deform_each(problem, own, targets, none, none, none, self.options)
+        def work(kind: Kind) -> tuple[Tensor, ARAPInfo] | None:
+            problem: Any = kind(rest, faces, mask, self.energy, self.degenerate)
+            positions = problem.positions(target, "target")
+            if handles is None:
+                chosen = problem.random_handles(self.fraction, generator or self.generator)
+            else:
+                chosen = problem.handles(handles)
+            return problem.deform(chosen, problem.goal_at(chosen, positions), self.options, None, None, None)
 
-    def _deform_batch(
-        self,
-        rest: Tensor,
-        target: Tensor,
-        faces: Tensor,
-        mask: Tensor | None,
-        handles: Tensor | None,
-        generator: torch.Generator | None,
-    ) -> tuple[Tensor, ARAPInfo] | None:
-        """Deform all meshes at once where they are, or return None for input that is not fit for it."""
-        if target.shape != rest.shape or not BatchedProblem.possible(rest, faces, mask):
-            return None
-        problem = BatchedProblem(rest, faces, mask, self.energy, self.degenerate)
-        goal = problem.positions(target)
-        if handles is None:
-            fixed = problem.random_handles(self.fraction, generator)
-        else:
-            chosen = problem.handles(handles)
-            if chosen is None:
-                return None
-            fixed, _ = chosen
-        goal = torch.where(fixed[..., None], goal, 0.0)
-        return problem.deform(fixed, goal, self.options, held=handles is None)
+        return dispatch(self.options.batched(rest.device), work)
 
     def extra_repr(self) -> str:
         """Options in the printed form of the module."""
         choices = ", ".join(f"{name}={value!r}" for name, value in vars(self.options).items())
         return f"{settings(self, 'fraction', 'energy', 'degenerate', 'generator')}, {choices}"
-
-
-def random_handles(problem: Problem, fraction: float, generator: torch.Generator | None) -> list[Tensor]:
-    """Random handles of each mesh: a share of its vertices, after one vertex of every component."""
-    sizes = [len(real) for real in problem.real]
-    device = "cpu" if generator is None else generator.device
-    scores = torch.rand(sum(sizes), generator=generator, device=device, dtype=torch.float64).cpu()
-    chosen = []
-    for rest, size, score in zip(problem.rests, sizes, scores.split(sizes), strict=True):
-        components = rest.components
-        best = score.new_zeros(int(components.max()) + 1).scatter_reduce(0, components, score, "amax")
-        forced = score == best[components]
-        quota = max(round(fraction * size), int(forced.sum()))
-        chosen.append(torch.topk(score + forced, quota).indices)
-    return chosen

@@ -1,19 +1,11 @@
 """The as-rigid-as-possible energy of a deformation, its rotations eliminated."""
 
-from typing import Any
-
-import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from meshkit._compile import uncompiled
-from meshkit.deform.batched import BatchedEnergy
-from meshkit.deform.batched_deform import BatchedProblem
+from meshkit.deform.dispatch import Kind, dispatch
 from meshkit.deform.factor import check_choice
-from meshkit.deform.problem import Problem
-from meshkit.deform.rest import ARAPRest, cell_edges
 from meshkit.deform.topology import check_energy
-from meshkit.topology import cotangent_weights
 
 __all__ = ["arap_energy"]
 
@@ -63,81 +55,11 @@ def arap_energy(
         tensor(3.)
     """
     check_choice("degenerate", degenerate, ("raise", "ignore"))
-    if verts.device.type != "cpu":
-        at_once = energy_of_batch(verts, faces, deformed, energy=energy, mask=mask, degenerate=degenerate)
-        if at_once is not None:
-            return at_once
-    problem = Problem(verts, faces, mask, energy, degenerate)
-    values = []
-    for rest, v, x in zip(problem.rests, problem.verts, problem.split(deformed, "deformed"), strict=True):
-        values.append(_Energy.apply(v, x, rest))
-    return problem.per_mesh(values).to(deformed.device, deformed.dtype)
-
-
-def energy_of_batch(
-    verts: Tensor, faces: Tensor, deformed: Tensor, *, energy: str, mask: Tensor | None, degenerate: str
-) -> Tensor | None:
-    """As :func:`arap_energy`, without leaving the device; None where the input needs the other path's checks."""
     check_energy(energy)
-    if deformed.shape != verts.shape or not BatchedProblem.possible(verts, faces, mask):
-        return None
-    problem = BatchedProblem(verts, faces, mask, energy, degenerate)
-    rest, x = (problem.positions(values) for values in (verts, deformed))
-    if problem.refused():
-        return None
-    values: Tensor = _BatchEnergy.apply(rest, x, problem.energy)
-    return (values if verts.dim() == 3 else values[0]).to(deformed.dtype)
 
+    def work(kind: Kind) -> Tensor | None:
+        problem = kind(verts, faces, mask, energy, degenerate)
+        values = problem.energies(deformed)
+        return values if values is None or problem.batched else values[0]
 
-class _BatchEnergy(torch.autograd.Function):
-    """`_Energy` for all meshes at once."""
-
-    @staticmethod
-    def forward(ctx: Any, verts: Tensor, deformed: Tensor, operators: BatchedEnergy) -> Tensor:
-        """Evaluate, and differentiate at once."""
-        rotations = operators.rotations(deformed.detach().flatten(0, 1))[operators.cells]
-        inputs = verts.detach().requires_grad_(), deformed.detach().requires_grad_()
-        with torch.enable_grad():
-            weights = torch.where(operators.kept, cotangent_weights(inputs[0], operators.faces), 0.0)
-            before, after = (operators.edges(positions) for positions in inputs)
-            turned = (rotations[:, :, :, None] @ before[:, :, None, ..., None]).squeeze(-1)
-            squares = (after[:, :, None] - turned).square().sum(-1)
-            energy = (weights[:, :, None] * operators.membership * squares).sum((1, 2, 3))
-            total = energy.sum()
-        if any(ctx.needs_input_grad):
-            ctx.save_for_backward(*torch.autograd.grad(total, inputs))
-        return energy.detach()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        """Scale the gradients."""
-        to_verts, to_deformed = ctx.saved_tensors
-        return grad[:, None, None] * to_verts, grad[:, None, None] * to_deformed, None
-
-
-class _Energy(torch.autograd.Function):
-    """Energy with the best rotations; held fixed they give the right first derivatives, and wrong second ones."""
-
-    @staticmethod
-    def forward(ctx: Any, verts: Tensor, deformed: Tensor, rest: ARAPRest) -> Tensor:
-        """Evaluate, and differentiate at once."""
-        topology = rest.topology
-        rotations = rest.rotations(deformed - rest.origin)[topology.cells]
-        inputs = verts.detach().requires_grad_(), deformed.detach().requires_grad_()
-        with torch.enable_grad():
-            weights = torch.where(rest.kept, cotangent_weights(inputs[0], topology.faces), 0.0)
-            before, after = (cell_edges(positions, topology) for positions in inputs)
-            turned = (rotations[:, :, None] @ before[:, None, :, :, None]).squeeze(-1)
-            squares = (after[:, None] - turned).square().sum(-1)
-            energy = (weights[:, None] * torch.from_numpy(topology.membership) * squares).sum()
-        if any(ctx.needs_input_grad):
-            ctx.save_for_backward(*torch.autograd.grad(energy, inputs))
-        return energy.detach()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        """Scale the gradients."""
-        to_verts, to_deformed = ctx.saved_tensors
-        return grad * to_verts, grad * to_deformed, None
+    return dispatch(verts.device.type != "cpu", work).to(deformed.device, deformed.dtype)

@@ -6,7 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from meshkit.deform.conjugate_gradients import diagonal_solver
 from meshkit.deform.rest import ARAPRest
+from meshkit.deform.sparse import csr_of_scipy
 
 __all__ = ["SOLVERS", "ARAPFactor"]
 
@@ -176,29 +178,9 @@ def _cholespy(matrix: Any) -> Callable[[Any], Any]:
 
 
 def _pcg(matrix: Any) -> Callable[[Any], Any]:
-    """Conjugate gradients, each column with its own step, to 1e-10 of the right-hand side."""
-    import numpy as np
-
-    matrix, inverse = matrix.tocsr(), 1 / matrix.diagonal()[:, None]
-
-    def solve(right: Any) -> Any:
-        x, r = np.zeros_like(right), right.copy()
-        z = inverse * r
-        p, rz = z, (r * z).sum(0)
-        goal = 1e-20 * rz
-        for _ in range(10 * len(right)):
-            if (rz <= goal).all():
-                break
-            image = matrix @ p
-            step = rz / np.maximum((p * image).sum(0), np.finfo(float).tiny)
-            x += step * p
-            r -= step * image
-            z = inverse * r
-            before, rz = rz, (r * z).sum(0)
-            p = z + rz / np.maximum(before, np.finfo(float).tiny) * p
-        return x
-
-    return solve
+    inverse = torch.from_numpy(1 / matrix.diagonal()[:, None])
+    solve = diagonal_solver(csr_of_scipy(matrix.tocsr()), inverse)
+    return lambda right: solve(torch.from_numpy(right)).numpy()
 
 
 def _optional(package: str) -> Any:

@@ -7,10 +7,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from meshkit.deform.objective import Objective, dot
-from meshkit.deform.options import warn_unconverged
-from meshkit.deform.rest import stationarity_gradient
-from meshkit.deform.rotation import ClosestRotation, RotationDifferential
+from meshkit.deform.objective import Objective
+from meshkit.deform.options import ARAPInfo, Options, warn_unconverged
 
 __all__ = ["SADDLE", "ImplicitMinimum"]
 
@@ -25,96 +23,56 @@ class ImplicitMinimum(torch.autograd.Function):
 
     At the minimum :math:`g(x, \theta) = 0` at the free vertices, so
     :math:`\bar\theta = -(\partial g/\partial\theta)^\top \lambda` with :math:`H_{ff} \lambda = \bar x_f`. The Hessian
-    :math:`H = L + W - B^\top D B` holds the derivative D
-    of the rotations; conjugate gradients solve it, with the factor of the forward pass as preconditioner.
+    :math:`H = L + W - B^\top D B` holds the derivative D of the rotations; conjugate gradients solve it, with the
+    inverse of the forward pass as preconditioner.
     """
 
     @staticmethod
     def forward(
         ctx: Any,
         verts: Tensor,
-        handle_pos: Tensor,
+        goal: Tensor,
         soft_targets: Tensor | None,
         soft_weights: Tensor | None,
-        minimum: Tensor,
+        x: Tensor,
         objective: Objective,
-        tol: float,
-        negative_curvature: Tensor,
-        residual: float,
-        forward_tol: float,
+        info: ARAPInfo,
+        options: Options,
     ) -> Tensor:
-        """Return the minimum."""
-        ctx.save_for_backward(minimum, soft_targets)
-        ctx.objective, ctx.tol, ctx.negative_curvature = objective, tol, negative_curvature
-        ctx.ended = residual, forward_tol
-        return minimum.clone()
+        """Return the minimum. All is (V, 3), the soft weights (V,); all but `verts` about the origin."""
+        ctx.save_for_backward(x, soft_targets)
+        ctx.objective, ctx.info, ctx.options = objective, info, options
+        return x.clone()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Solve for the adjoint, then differentiate the stationarity condition."""
-        minimum, soft_targets = ctx.saved_tensors
-        factor, rest = ctx.objective.factor, ctx.objective.rest
-        origin = rest.origin
-        x = minimum - origin
-        hessian = _Hessian(ctx.objective, x, torch.float32 if ctx.tol >= 1e-4 else torch.float64)
-        adjoint, negative = hessian.solve(grad, ctx.tol)
-        if negative:
-            ctx.negative_curvature.fill_(True)
+        x, soft_targets = ctx.saved_tensors
+        objective: Objective = ctx.objective
+        edges, soft = objective.edges, objective.soft
+        R, turned = objective.linearise(x, precise=ctx.options.grad_tol < 1e-4)
+
+        def product(direction: Tensor, change: Tensor) -> Tensor:
+            return objective.stiffness @ direction - objective.pulled_back(change)
+
+        adjoint, negative = objective.solve_hessian(
+            lambda direction: product(direction, turned(direction)), grad, tol=ctx.options.grad_tol
+        )
+        ctx.info.negative_curvature.logical_or_(negative)
+        if bool(negative.any()):
             warnings.warn(SADDLE, stacklevel=2)
-        warn_unconverged(*ctx.ended)
-        change = hessian.rotation_change(adjoint)
+        warn_unconverged(float(ctx.info.residual.amax()), ctx.options.tol)
+        change = turned(adjoint)
         wanted = ctx.needs_input_grad
-        grads: list[Tensor | None] = [None] * 10
+        grads: list[Tensor | None] = [None] * len(wanted)
         if wanted[0]:
-            grads[0] = -stationarity_gradient(rest, x, adjoint, hessian.R, change)
+            rotations = (objective.component_first(value) for value in (R, change))
+            grads[0] = -edges.stationarity_gradient(objective.verts, x, adjoint, *rotations)
         if wanted[1]:
-            grads[1] = (grad - hessian.product(adjoint, change))[factor.handles]
-        if factor.soft is not None and wanted[2]:
-            grads[2] = factor.soft[:, None] * adjoint
-        if factor.soft is not None and wanted[3]:
-            grads[3] = -(adjoint * (minimum - soft_targets)).sum(1) / rest.topology.multiplicity
+            grads[1] = torch.where(objective.free, 0.0, grad - product(adjoint, change))
+        if soft is not None and wanted[2]:
+            grads[2] = soft * adjoint
+        if soft is not None and wanted[3]:
+            grads[3] = -(adjoint * (x - soft_targets)).sum(1) / edges.multiplicity
         return tuple(grads)
-
-
-class _Hessian:
-    """Hessian over 2m of the energy with its rotations eliminated."""
-
-    def __init__(self, objective: Objective, x: Tensor, dtype: torch.dtype) -> None:
-        self.objective, self.factor, self.dtype = objective, objective.factor, dtype
-        S = objective.matrices(x, torch.float64)
-        last = objective.tracker.last
-        self.R = ClosestRotation.apply(S, None if last is None else last[0].double())[0].to(dtype)
-        self.differential = RotationDifferential(S.to(dtype), self.R)
-
-    def rotation_change(self, direction: Tensor) -> Tensor:
-        """D[B p], component first."""
-        return self.differential(self.objective.matrices(direction, self.dtype))
-
-    def product(self, direction: Tensor, change: Tensor | None = None) -> Tensor:
-        """H p for a direction (V, 3)."""
-        change = self.rotation_change(direction) if change is None else change
-        return (self.objective.stiffness @ direction).sub_(self.objective.pulled_back(change))
-
-    def solve(self, right: Tensor, tol: float) -> tuple[Tensor, bool]:
-        """Adjoint (V, 3), zero at the handles, by preconditioned conjugate gradients; whether p^T H p <= 0 ended it."""
-        objective = self.objective
-        residual = right.index_select(0, self.factor.free)
-        solution = torch.zeros_like(residual)
-        direction = objective.solve(residual)
-        square = first = dot(residual, direction)
-        for iteration in range(500):
-            if square <= tol * tol * first:
-                break
-            image = self.product(objective.spread(direction)).index_select(0, self.factor.free)
-            curvature = dot(direction, image)
-            if curvature <= 0:
-                # One step with the rotations held fixed is better than none.
-                return objective.spread(solution if iteration else direction), True
-            step = square / curvature
-            solution.add_(direction, alpha=step)
-            residual.sub_(image, alpha=step)
-            scaled = objective.solve(residual)
-            before, square = square, dot(residual, scaled)
-            direction = scaled.add_(direction, alpha=square / before)
-        return objective.spread(solution), False

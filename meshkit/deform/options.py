@@ -48,6 +48,11 @@ class Options:
     solver: str
     compiled: bool
 
+    @property
+    def unroll(self) -> bool:
+        """Whether autograd is to record the iterations."""
+        return self.grad == "unroll" and torch.is_grad_enabled()
+
     def batched(self, device: torch.device) -> bool:
         """Whether the whole batch is to be solved at once where its tensors are."""
         if self.solver == "dense":

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from meshkit.deform.face_edges import FaceEdges
 from meshkit.deform.rotation import closest_rotation
 from meshkit.deform.topology import ARAPTopology
 from meshkit.topology import cotangent_weights
@@ -29,6 +30,8 @@ class ARAPRest:
         laplacian: (V, V) scipy CSR matrix L, positive semi-definite.
         moments, moments_t: (3K, V) scipy CSR matrix B, whose rows 3i + d give column d of S_i, and its transpose.
         rest_energy: m v^T L v, the energy of collapsing the mesh to a point.
+        force_at_rest: (V, 3) L v, which is B^T R where every rotation is the identity.
+        edges: of the faces, and which of them count.
         components: (V,) int64 labels of the components that the weights hold together.
 
     Raises:
@@ -62,78 +65,27 @@ class ARAPRest:
         regular = (weights != 0).any(1)
         if degenerate == "raise" and not regular.all():
             _refuse(f, edges, regular)
-        self.regular = torch.from_numpy(regular)
-        self.kept = torch.from_numpy(topology.kept(weights) & regular[:, None])
-        weights = weights * self.kept.numpy()
+        kept = topology.kept(weights) & regular[:, None]
+        counts = torch.from_numpy(regular), torch.from_numpy(kept)
+        self.edges = FaceEdges(topology.faces, topology.cells, topology.membership, topology.multiplicity, *counts)
+        weights = weights * kept
         self.laplacian = topology.square.matrix((topology.stiffness @ weights.T).ravel())
         scaled = weights[:, :, None] * edges / topology.multiplicity
         entries = topology.moment @ scaled.transpose(1, 0, 2).reshape(3, -1)
         self.moments, self.moments_t = topology.interleaved.matrices(entries.reshape(-1, 3))
-        self.rest_energy = topology.multiplicity * float(np.vdot(v, self.laplacian @ v))
+        force = self.laplacian @ v
+        self.force_at_rest = torch.from_numpy(force)
+        self.rest_energy = topology.multiplicity * float(np.vdot(v, force))
         # An edge opposite two right angles weighs zero and still lies in the cells of spokes and rims.
         joined = weights != 0 if topology.energy == "spokes" else np.broadcast_to(regular[:, None], weights.shape)
         tail, head = f[:, [2, 0, 1]][joined], f[:, [1, 2, 0]][joined]
         joining = sparse.csr_array((np.ones(len(tail)), (tail, head)), shape=self.laplacian.shape)
         self.components = torch.from_numpy(sparse.csgraph.connected_components(joining, directed=False)[1]).long()
 
-    def cell_moments(self, x: Any) -> Any:
-        """Matrices S of positions (V, 3) as (K, 3, 3), the axes being (cell, column, row)."""
-        return (self.moments @ x).reshape(-1, 3, 3)
-
     def rotations(self, x: Tensor) -> Tensor:
         """Best rotations (K, 3, 3) for positions (V, 3), in float64."""
-        moments = torch.from_numpy(self.cell_moments(x.detach().cpu().double().numpy()))
-        return closest_rotation(moments.transpose(1, 2))
-
-
-def stationarity_gradient(rest: ARAPRest, x: Tensor, adjoint: Tensor, rotations: Tensor, change: Tensor) -> Tensor:
-    r"""Gradient with respect to v of :math:`\lambda \cdot (L x - B^\top R)`, the change of the rotations included.
-
-    That change of R is :math:`D[dS]` with D self-adjoint, so :math:`\lambda\cdot(L x - B^\top R) - D[B\lambda]\cdot Bx`
-    has the wanted derivative while R and D[Bλ] are held fixed. It is a sum over the edges e of the faces,
-
-    .. math:: \sum_e w_e \bigl(\lambda_e \cdot x_e
-              - (\bar R^\top \lambda_e + \overline{D[B\lambda]}^\top x_e) \cdot v_e\bigr)
-
-    Args:
-        rest: of v.
-        x: (V, 3) positions.
-        adjoint: (V, 3) the vector λ.
-        rotations: (3, 3, K) R at x, as (column, row, cell).
-        change: (3, 3, K) D[Bλ], likewise.
-
-    Returns:
-        (V, 3).
-    """
-    topology = rest.topology
-    moved, along = _face_edges(x, topology), _face_edges(adjoint, topology)
-    image = (topology.mean_rotations(rotations) * along).sum(1) + (topology.mean_rotations(change) * moved).sum(1)
-    work = (along * moved).sum(0)
-    with torch.enable_grad():
-        v = _face_edges(rest.verts, topology).requires_grad_()
-        # Twice the area and the half cotangents, from the edges alone.
-        x0, y0, z0 = v[:, 0]
-        x1, y1, z1 = v[:, 1]
-        squared = (y0 * z1 - z0 * y1).square() + (z0 * x1 - x0 * z1).square() + (x0 * y1 - y0 * x1).square()
-        doubled = torch.where(rest.regular, squared, 1.0).sqrt()
-        weights = -0.5 * torch.stack([(v[:, k - 2] * v[:, k - 1]).sum(0) for k in range(3)]) / doubled
-        value = (torch.where(rest.kept.T, weights, 0.0) * (work - (image * v).sum(0))).sum()
-    (edges,) = torch.autograd.grad(value, v)
-    corners = torch.stack([edges[:, k - 1] - edges[:, k - 2] for k in range(3)], 1)
-    gathered = torch.zeros(3, topology.num_verts, dtype=torch.float64, device="cpu")
-    return gathered.index_add_(1, topology.faces.T.flatten(), corners.flatten(1)).T
-
-
-def _face_edges(positions: Tensor, topology: ARAPTopology) -> Tensor:
-    """Edge vectors as (3, 3, F): (coordinate, edge, face), an order that suits elementwise work."""
-    corners = positions.T.contiguous().index_select(1, topology.faces.T.flatten()).unflatten(1, (3, -1))
-    return torch.stack([corners[:, k - 2] - corners[:, k - 1] for k in range(3)], 1)
-
-
-def cell_edges(positions: Tensor, topology: ARAPTopology) -> Tensor:
-    """Edge vectors (F, 3, 3) of the faces, edge k opposite corner k."""
-    corners = positions[topology.faces]
-    return corners[:, [1, 2, 0]] - corners[:, [2, 0, 1]]
+        columns = torch.from_numpy(self.moments @ x.detach().cpu().double().numpy()).view(-1, 3, 3)
+        return closest_rotation(columns.mT)
 
 
 def _refuse(faces: Any, edges: Any, regular: Any) -> None:

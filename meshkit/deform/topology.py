@@ -58,10 +58,8 @@ class ARAPTopology:
         self.cells = torch.from_numpy(cells)
         self.num_cells = count if per_face else num_verts
         templates = local_templates(energy, torch.device("cpu"))
-        self.multiplicity = templates.multiplicity
-        self.membership, self.stiffness, self.moment = (
-            value.numpy() for value in (templates.membership, templates.stiffness, templates.moment)
-        )
+        self.multiplicity, self.membership = templates.multiplicity, templates.membership
+        self.stiffness, self.moment = templates.stiffness.numpy(), templates.moment.numpy()
         self.square = Pattern(np.repeat(f.T, 3, 0).ravel(), np.tile(f.T, (3, 1)).ravel(), (num_verts, num_verts))
         self.tall = (
             Pattern(np.repeat(cells.T, 3, 0).ravel(), f.T.ravel(), (self.num_cells, num_verts))
@@ -93,17 +91,6 @@ class ARAPTopology:
             return np.ones(weights.shape, dtype=bool)
         total = np.bincount(self.edge, weights.ravel(), minlength=1)
         return (total > 0)[self.edge].reshape(weights.shape)
-
-    def mean_rotations(self, rotations: Tensor) -> Tensor:
-        """Sum over the cells of each edge of a face, over m: (3, 3, K) to (3, 3, 3, F), or (3, 3, 1, F) if equal.
-
-        The axes of the result are (column, row, edge, face).
-        """
-        around = [rotations.index_select(2, column).double() for column in self.cells.T.contiguous()]
-        total = torch.stack(around).sum(0)[:, :, None]
-        if not self.membership.all():
-            total = total - torch.stack(around, 2)
-        return total / self.multiplicity
 
 
 @dataclass(frozen=True)
