@@ -3,8 +3,9 @@
 from collections.abc import Iterable
 from difflib import SequenceMatcher
 from importlib.resources import files
+from typing import Any
 
-__all__ = ["did_you_mean", "nearest", "shipped_weights"]
+__all__ = ["did_you_mean", "nearest", "shipped_weights", "weights_folder"]
 
 _ALIKE = 0.6  # share of letters in common from which on a name may have been meant, as difflib's get_close_matches
 
@@ -33,9 +34,14 @@ def did_you_mean(word: str, names: Iterable[str]) -> str:
     return "" if name is None else f": did you mean {name}?"
 
 
+def weights_folder() -> Any:  # a Traversable, whose place in the library depends on the version of Python
+    """Where the weights lie that come with this installation."""
+    return files("meshkit") / "weights"
+
+
 def shipped_weights() -> list[str]:
     """Names of the weights that come with this installation, sorted."""
-    folder = files("meshkit") / "weights"
+    folder = weights_folder()
     ending = ".safetensors"
     if not folder.is_dir():
         return []

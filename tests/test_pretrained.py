@@ -159,7 +159,7 @@ def test_export_and_load_again(exporter, finished_run, bodies, tmp_path, monkeyp
     words = ["export_weights.py", str(folder), "tiny-humans", "--out", str(weights), "--usual-pairs", "2"]
     monkeypatch.setattr(sys, "argv", words)
     exporter.main()
-    monkeypatch.setattr(pretrained, "files", lambda package: tmp_path)
+    monkeypatch.setattr("meshkit._names.files", lambda package: tmp_path)
     assert pretrained_names() == ["tiny-humans"]
 
     stored = load_file(weights / "tiny-humans.safetensors")
@@ -306,7 +306,7 @@ def test_a_card_is_read_without_the_weights(monkeypatch):
 
 
 def test_no_folder_is_no_weights(tmp_path, monkeypatch):
-    monkeypatch.setattr(pretrained, "files", lambda package: tmp_path)
+    monkeypatch.setattr("meshkit._names.files", lambda package: tmp_path)
     assert pretrained_names() == []
     with pytest.raises(ValueError, match="there are none"):
         load_pretrained("xdualnet-humans")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import warnings
-from importlib.resources import files
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from meshkit._names import did_you_mean, shipped_weights
+from meshkit._names import did_you_mean, shipped_weights, weights_folder
 from meshkit.batching import bounding_box_center, center, check_mask
 from meshkit.descriptors import intrinsic_descriptors
 from meshkit.models.generator import PoseTransferGenerator
@@ -227,7 +226,7 @@ def read_card(name: str) -> dict[str, Any]:
     """
     if name not in pretrained_names():
         raise ValueError(f"no weights are named {name!r}{instead_of(name)}")
-    return dict(json.loads((files("meshkit") / "weights" / f"{name}.json").read_text(encoding="utf-8")))
+    return dict(json.loads((weights_folder() / f"{name}.json").read_text(encoding="utf-8")))
 
 
 def load_pretrained(name: str, *, device: torch.device | str = "cpu") -> PretrainedTransfer:
@@ -255,7 +254,7 @@ def load_pretrained(name: str, *, device: torch.device | str = "cpu") -> Pretrai
     from safetensors.torch import load
 
     card = read_card(name)
-    folder = files("meshkit") / "weights"
+    folder = weights_folder()
     config = GeneratorConfig.from_json(json.dumps(card["model"]))
     state = load((folder / f"{name}.safetensors").read_bytes())
     generator = config.build()
