@@ -50,6 +50,7 @@ def arap_energy(
         elements).
 
     Example:
+        >>> import torch
         >>> verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
         >>> arap_energy(verts, torch.tensor([[0, 1, 2]]), 2 * verts)
         tensor(3.)
