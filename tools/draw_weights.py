@@ -25,6 +25,7 @@ ROWS = (  # weights, body, rows of the list of test pairs
 WARPED = (11, 22)  # rows whose warps differ
 WAYS = {"matching's means": (None, None), "rigid MLS": (0.25, None), "Poisson": (0.15, 0.2)}  # radius, weight
 EXCHANGED = (62, 48, 83)  # rows where xdualnet-humans takes one lower leg for the other
+TAILS = (195, 351)  # rows where xdualnet-animals takes the fox's tail for a leg
 
 
 def load_pair(body, row):
@@ -105,7 +106,26 @@ def draw_warps() -> None:
     )
 
 
+@torch.no_grad()
+def draw_tails() -> None:
+    net, (body, split) = load_pretrained("xdualnet-animals"), load_shipped("animals")
+    pictures, captions = [], []
+    for row in TAILS:
+        identity, pose, truth = load_pair(body, split.test_pairs[row])
+        result = net.output(identity, pose, identity_faces=body.faces, pose_faces=body.faces)
+        colors = position_colors(pose[0])
+        meshes, bounds = together([identity, pose, result.vertices, truth])
+        painted = [colors[result.plan.argmax()[0]], colors, None, None]
+        views = zip(meshes, painted, strict=True)
+        pictures.append([render(v, body.faces, colors=c, bounds=bounds, size=(260, 220), azimuth=70) for v, c in views])
+        captions.append(["matched places", "", score(meshes[2], meshes[3]), ""])
+    titles = ["identity", "pose", "output", "ground truth"]
+    sheet = contact_sheet(pictures, column_titles=titles, captions=captions)
+    sheet.quantize(255).save(IMAGES / "tails.png", optimize=True)
+
+
 if __name__ == "__main__":
     draw_weights()
     draw_exchanged_limbs()
     draw_warps()
+    draw_tails()
