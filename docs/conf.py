@@ -51,7 +51,8 @@ nitpicky = True
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!meshkit\.).*"),
     (r"py:class", r"meshkit\.(\w+\.)?_\w+\..*"),
-    (r"py:class", r"meshkit\.(deform\.correspondence\.Plan|deform\.dispatch\.Result|nn\.setconv\.Neighborhoods|ot\.sample\.SamplePlan)"),
+    (r"py:class", r"meshkit\.deform\.(correspondence\.Plan|dispatch\.Result)"),
+    (r"py:class", r"meshkit\.(nn\.setconv\.Neighborhoods|ot\.sample\.SamplePlan)"),
 ]
 
 sphinx_gallery_conf = {
