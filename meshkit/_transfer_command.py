@@ -15,7 +15,12 @@ __all__ = ["FORMATS", "UNITS", "check", "main", "parser"]
 FORMATS = (".obj", ".ply", ".off", ".stl", ".glb")
 UNITS = ("m", "cm", "mm", "in", "ft")
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
-_WRITTEN_OUT = {"metres": "m", "centimetres": "cm", "millimetres": "mm", "inches": "in", "feet": "ft", "foot": "ft"}
+_WRITTEN_OUT = {
+    f"{power}met{end}": f"{short}m"
+    for power, short in (("", ""), ("centi", "c"), ("milli", "m"))
+    for end in ("re", "er")
+}
+_WRITTEN_OUT |= {"inch": "in", "inche": "in", "foot": "ft", "feet": "ft"}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -52,14 +57,22 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _one_of(names: Sequence[str], written_out: Mapping[str, str] | None = None) -> Callable[[str], str]:
-    """A type of argparse's: one of the names. A mistake is told with the nearest of them, and all there are."""
-    meant = {name: name for name in names} | dict(written_out or {})
+    """A type of argparse's: one of the names. A mistake is told with the nearest of them, and all there are.
+
+    Of units the nearest letters say nothing, km is no m: with ``written_out`` only what says the same is named.
+    """
+
+    def meant(word: str) -> str | None:
+        if written_out is None:
+            return nearest(word, names)
+        plain = word.casefold()
+        return plain if plain in names else written_out.get(plain.removesuffix("s"))
 
     def read(word: str) -> str:
         if word in names:
             return word
-        near = nearest(word, meant)
-        instead = "" if near is None else f": did you mean {meant[near]}?"
+        near = meant(word)
+        instead = "" if near is None else f": did you mean {near}?"
         raise argparse.ArgumentTypeError(f"takes {', '.join(names[:-1])} or {names[-1]}, got {word!r}{instead}")
 
     return read

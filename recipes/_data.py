@@ -135,7 +135,7 @@ def with_sampled_identities(
     if not bone_spread:
         return body, split
     assert body.identities is not None
-    draw = torch.Generator().manual_seed(seed)
+    draw = torch.Generator().manual_seed(seed + 1)  # not the numbers that the identities were drawn with
     factors = sample_bone_factors(body.joints, body.parents, count, spread=bone_spread, generator=draw)
     verts, joints = scale_bones(*body.shape(body.identities[first:]), body.weights, body.parents, factors)
     known, added = body.identities[:first], torch.eye(count)

@@ -81,7 +81,11 @@ PRESETS = {
 
 def build(cfg: Config) -> tuple[torch.nn.Module, torch.nn.Module]:
     """The generator, which is trained as it is."""
+    if not (cfg.lambda_rec or cfg.lambda_edge or cfg.lambda_match):
+        raise UserError("nothing to learn: one of --lambda-rec, --lambda-edge and --lambda-match must not be 0")
     generator = cfg.model.build()
+    if not (cfg.lambda_rec or cfg.lambda_edge):
+        generator.transfer.requires_grad_(False)  # the matching alone learns
     return generator, generator
 
 
@@ -95,7 +99,7 @@ def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float
     if cfg.lambda_edge:
         losses["edge"] = cfg.lambda_edge * edge_ratio_loss(output, batch.identity, batch.identity_faces)
     if cfg.lambda_match:
-        if not bool((batch.correspondence >= 0).any()):
+        if progress == 0 and not bool((batch.correspondence >= 0).any()):
             raise UserError(f"--lambda-match needs true matches, which --data {cfg.data} does not know: drop it")
         losses["match"] = cfg.lambda_match * matching_loss(result.plan, batch.correspondence)
     return losses

@@ -11,6 +11,7 @@ from torch.autograd import gradcheck
 
 from meshkit.data import (
     RiggedModel,
+    load_animals,
     load_humans,
     rotation_matrices,
     sample_bone_factors,
@@ -294,6 +295,21 @@ def test_bone_factors_are_those_of_limbs_and_of_both_sides():
         )
     )
     assert bool((sample_bone_factors(humans.joints, humans.parents, 2, spread=0.0) == 1).all())
+
+
+@pytest.mark.parametrize("load", [load_animals, load_humans])
+def test_bone_factors_of_all_joints_are_those_of_their_mirror_images(load):
+    """Also where joints lie at one place, as the hips at the root and the fingers' roots in the hand."""
+    body = load()
+    at = body.joints - body.joints[0]
+    factors = sample_bone_factors(body.joints, body.parents, 3, spread=0.3)
+    for joint, place in enumerate(at):
+        alike = [other for other in range(len(at)) if torch.equal(factors[:, joint], factors[:, other])]
+        assert len(alike) <= 2
+        if abs(place[0]) > 0.02:
+            assert len(alike) == 2 and torch.allclose(
+                at[sum(alike) - joint], place * torch.tensor([-1.0, 1, 1]), atol=0.01
+            )
 
 
 def test_bones_of_other_shapes_are_refused():

@@ -75,6 +75,23 @@ def both(device: str, inputs: dict[str, Any], **options: Any) -> list[tuple[torc
 # ---------------------------------------------------------------- parts
 
 
+def test_meshes_of_any_strides() -> None:
+    """Columns side by side, as of a tensor that was transposed; on the way that CUDA tensors take as well."""
+    verts, faces = grid(4, 0)
+    handles = torch.tensor([0, 3, len(verts) - 1])
+    strided = verts.T.contiguous().T
+    assert not strided.is_contiguous()
+    found = []
+    for x in (verts, strided):
+        x = x.detach().requires_grad_()
+        bent, _ = arap_deform(x, faces, handles, x.detach()[handles] + 0.1, init=x.detach() * 1.01, solver="dense")
+        upstream = torch.arange(3.0, dtype=bent.dtype).expand(len(bent), 3)
+        upstream = upstream.contiguous() if x.is_contiguous() else upstream.T.contiguous().T
+        found.append((bent.detach(), torch.autograd.grad(bent, x, upstream)[0]))
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7)
+
+
 @ON_DEVICES
 def test_rotations_equal_the_closed_form(device: str) -> None:
     S = torch.cat([rand(200, 3, 3), 1e-25 * rand(9, 3, 3, seed=1), torch.eye(3).double()[None]]).to(device)

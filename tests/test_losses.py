@@ -615,6 +615,15 @@ def test_matching_reaches_what_is_matched_to_the_wrong_place():
     assert float(torch.autograd.grad(loss, x)[0].abs().max()) > 0.1
 
 
+def test_matching_of_what_has_no_mass_has_finite_gradients():
+    """A row of nothing, an entry of nothing, and padding, in a stored plan."""
+    plan = torch.tensor([[[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.0]]], requires_grad=True)
+    loss = matching_loss(plan, torch.tensor([[0, 1, 0, -1]]))
+    assert loss.item() == pytest.approx((math.log(2) + math.log(0.5 / torch.finfo(torch.float32).tiny)) / 2, rel=1e-5)
+    (gradient,) = torch.autograd.grad(loss, plan)
+    assert gradient.tolist() == [[[0, 0], [1, 1], [-0.5, 0.5], [0, 0]]]
+
+
 def test_matching_bounds():
     uniform = torch.full((1, 3, 8), 0.2)
     assert matching_loss(uniform, torch.tensor([[0, 3, 7]])).item() == pytest.approx(math.log(8))
@@ -631,6 +640,8 @@ def test_matching_errors():
         matching_loss(plan, torch.zeros(2, 4, dtype=torch.int64))
     with pytest.raises(ValueError, match=r"got torch.float32 of \(2, 3\)"):
         matching_loss(plan, torch.zeros(2, 3))
+    with pytest.raises(ValueError, match=r"got torch.bool of \(2, 3\)"):
+        matching_loss(plan, torch.zeros(2, 3, dtype=torch.bool))
     with pytest.raises(ValueError, match=r"a plan must have shape \(B, N, M\), got \(3, 4\)"):
         matching_loss(plan[0], torch.zeros(3, dtype=torch.int64))
     with pytest.raises(ValueError, match="reduction must be one of"):

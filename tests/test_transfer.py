@@ -1093,6 +1093,8 @@ def test_an_axis_with_a_minus_may_stand_alone():
             "--identity-unit centimetre",
             "argument --identity-unit: takes m, cm, mm, in or ft, got 'centimetre': did you mean cm?",
         ),
+        ("--pose-unit km", "argument --pose-unit: takes m, cm, mm, in or ft, got 'km'"),
+        ("--pose-unit Feet", "argument --pose-unit: takes m, cm, mm, in or ft, got 'Feet': did you mean ft?"),
         ("--pose-unit Inch", "argument --pose-unit: takes m, cm, mm, in or ft, got 'Inch': did you mean in?"),
         ("--frame identiy", "argument --frame: takes pose or identity, got 'identiy': did you mean identity?"),
     ],

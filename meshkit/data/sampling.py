@@ -179,13 +179,26 @@ def sample_bone_factors(
     if count < 0 or not 0 <= spread < math.inf:
         raise ValueError(f"count and spread must not be negative, got {count} and {spread}")
     check_parents(parents.tolist())
-    mirrored = torch.cdist(joints * joints.new_tensor([-1.0, 1.0, 1.0]), joints).argmin(1).tolist()
+    # Joints may lie at one place, as those of a hand's fingers: what follows them tells them apart.
+    places = torch.stack([joints, _subtree_means(joints, parents.tolist())], 1)
+    mirrored = (
+        torch.cdist((places * joints.new_tensor([-1.0, 1.0, 1.0])).flatten(1), places.flatten(1)).argmin(1).tolist()
+    )
     limbs = _limbs(parents.tolist())
     same_joint = [min(joint, other) for joint, other in enumerate(mirrored)]
     same_limb = [min(limbs[joint], limbs[other]) for joint, other in enumerate(mirrored)]
     device = "cpu" if generator is None else generator.device
     drawn = torch.randn(2, count, len(parents), 3, generator=generator, device=device, dtype=joints.dtype).to(joints)
     return (spread * (drawn[0, :, same_limb] + drawn[1, :, same_joint] / 2)).exp()
+
+
+def _subtree_means(joints: Tensor, parents: list[int]) -> Tensor:
+    """Mean (J, 3) of each joint and all that follow it."""
+    sums, counts = list(joints), [1] * len(parents)
+    for joint in range(len(parents) - 1, 0, -1):
+        sums[parents[joint]] = sums[parents[joint]] + sums[joint]
+        counts[parents[joint]] += counts[joint]
+    return torch.stack([total / count for total, count in zip(sums, counts, strict=True)])
 
 
 def _limbs(parents: list[int]) -> list[int]:

@@ -31,7 +31,7 @@ def conjugate_gradients(
     direction = precondition(residual)
     square = first = float(dot(residual, direction))
     for iteration in range(max_iter):
-        if square <= tol * tol * first:
+        if not square > tol * tol * first:  # also where it is NaN
             break
         image = product(direction)
         curvature = float(dot(direction, image))

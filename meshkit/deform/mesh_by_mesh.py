@@ -179,6 +179,6 @@ class MeshByMesh(Problem):
         """Energies (B,) of deformed positions."""
         values = []
         for rest, v, x in zip(self.rests, self.verts, self.positions(deformed, "deformed"), strict=True):
-            rotations = rest.rotations(x - rest.origin).permute(2, 1, 0).contiguous()
+            rotations = rest.rotations((x - rest.origin).detach()).permute(2, 1, 0).contiguous()
             values.append(EnergyOfMeshes.apply(v, x, rest.edges, rotations, 1))
         return torch.cat(values)

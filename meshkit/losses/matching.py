@@ -1,5 +1,6 @@
 """Matching loss: negative log-likelihood of the true matches under a transport plan."""
 
+import math
 from typing import Protocol
 
 import torch
@@ -43,7 +44,8 @@ def matching_loss(plan: Tensor | RowPlanLike, correspondence: Tensor, *, reducti
             sample, ``(B,)``.
 
     Returns:
-        A scalar, or ``(B,)``, in nats. A sample without known matches counts 0; log M is what a uniform plan has.
+        A scalar, or ``(B,)``, in nats; log M for a uniform plan. A sample without known matches counts 0. An entry of
+        zero counts as the smallest normal number, without a gradient.
 
     Raises:
         ValueError: if shapes or types do not fit, or the reduction is unknown.
@@ -61,7 +63,7 @@ def matching_loss(plan: Tensor | RowPlanLike, correspondence: Tensor, *, reducti
     check_reduction(reduction)
     if isinstance(plan, Tensor) and plan.dim() != 3:
         raise ValueError(f"a plan must have shape (B, N, M), got {tuple(plan.shape)}")
-    if correspondence.shape != plan.shape[:2] or correspondence.is_floating_point():
+    if correspondence.shape != plan.shape[:2] or correspondence.dtype not in (torch.int64, torch.int32):
         raise ValueError(
             f"correspondence must be integers of shape (B, N) = {tuple(plan.shape[:2])}, got {correspondence.dtype} of "
             f"{tuple(correspondence.shape)}"
@@ -69,12 +71,20 @@ def matching_loss(plan: Tensor | RowPlanLike, correspondence: Tensor, *, reducti
     known = correspondence >= 0
     if isinstance(plan, Tensor):
         plan = at_least_float32(plan)
-        masses, at = plan.sum(2), plan.gather(2, correspondence.clamp_min(0).long()[..., None])[..., 0].log()
+        entries = plan.gather(2, correspondence.clamp_min(0).long()[..., None])[..., 0]
+        masses, at = plan.sum(2), logarithm(entries)
     else:
         masses, at = plan.row_sums(), plan.log_at(correspondence)
     known = known & (masses > 0)  # a row of no weight has no distribution
+    at = torch.where(at.isneginf(), math.log(torch.finfo(at.dtype).tiny), at)
     bits = torch.where(known, masses, 1.0).log() - torch.where(known, at, 0.0)
     return reduce_samples(torch.where(known, bits, 0.0).sum(1), known.sum(1), reduction)
+
+
+def logarithm(entries: Tensor) -> Tensor:
+    """Logarithms, -inf with a gradient of zero (not NaN) where there is nothing."""
+    nothing = entries <= 0
+    return torch.where(nothing, 1.0, entries).log().masked_fill(nothing, -torch.inf)
 
 
 class MatchingLoss(nn.Module):
