@@ -19,6 +19,7 @@ from meshkit.deform import (
     arap_deform,
     arap_energy,
 )
+from meshkit.deform.conjugate_gradients import conjugate_gradients
 from meshkit.deform.mesh_objective import MeshObjective
 
 ENERGIES = ["spokes_and_rims", "spokes", "spokes_unclamped", "elements"]
@@ -405,3 +406,12 @@ def test_memory_is_linear() -> None:
     objective = MeshObjective(ARAPFactor(rest, torch.arange(0, len(verts), 9)), None, dtype=torch.float32)
     kept = [value for value in vars(objective).values() if isinstance(value, torch.Tensor)]
     assert sum(t.values().numel() if t.layout == torch.sparse_csr else t.numel() for t in kept) < 80 * len(verts)
+
+
+def test_conjugate_gradients_end_at_nan():
+    """A gradient of NaN from above is not worth thousands of products."""
+    products = []
+    right = torch.full((4, 3), torch.nan, dtype=torch.float64)
+    options = {"dot": lambda a, b: (a * b).sum(), "tol": 1e-8, "max_iter": 100}
+    solution, _ = conjugate_gradients(lambda x: products.append(x) or 2 * x, lambda x: x, right, **options)
+    assert not products and solution.shape == right.shape
