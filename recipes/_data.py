@@ -54,9 +54,9 @@ def unit_of(kind: str) -> str:
 def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -> tuple[Pairs, Pairs]:
     """Training and test pairs of ``--data``; those of rigged bodies are made on ``device``."""
     kind, _, place = cfg.data.partition(":")
-    if kind not in ("humans", "animals", "smpl", "smal", *SCANNERS) or (kind in ("humans", "animals")) == bool(place):
-        close = did_you_mean(kind, ("humans", "animals", "smpl", "smal", *SCANNERS))
-        raise UserError(f"--data must be {KINDS}; got {cfg.data!r}{close}")
+    kinds = ("humans", "animals", "smpl", "smal", *SCANNERS)
+    if kind not in kinds or (kind in ("humans", "animals")) == bool(place):
+        raise UserError(f"--data must be {KINDS}; got {cfg.data!r}{did_you_mean(kind, kinds)}")
     if place and not Path(place).exists():
         raise UserError(f"--data {cfg.data}: there is no {place}")
     try:

@@ -38,8 +38,9 @@ def check(cfg: Any) -> None:
         raise UserError("--steps 0 evaluates weights without training: say with --init which")
     for name in counts:
         value = getattr(cfg, name, None)
-        if value is not None and value < (name != "steps"):
-            raise UserError(f"--{name.replace('_', '-')} must be at least {int(name != 'steps')}, got {value}")
+        least = 0 if name == "steps" else 1
+        if value is not None and value < least:
+            raise UserError(f"--{name.replace('_', '-')} must be at least {least}, got {value}")
     for name in ("sampled_identities", "sampled_poses", "workers", "threads", "warmup"):
         if getattr(cfg, name, 0) < 0:
             raise UserError(f"--{name.replace('_', '-')} must not be negative, got {getattr(cfg, name)}")

@@ -7,7 +7,6 @@ import json
 import time
 from collections.abc import Callable
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm import tqdm, trange
 
+from meshkit._names import weights_folder
 from meshkit.batching import center
 from meshkit.data import MeshPool, PosePairs, load_humans, load_shipped
 from meshkit.deform import deformation_transfer
@@ -87,7 +87,7 @@ def fingerprint(name: str, out: Path) -> str:
 
 def shipped_file(name: str) -> Path:
     """The file of shipped weights."""
-    return Path(str(files("meshkit.weights") / f"{name}.safetensors"))
+    return Path(str(weights_folder() / f"{name}.safetensors"))
 
 
 def digest(file: Path) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -129,9 +129,8 @@ class RiggedModel(nn.Module):
         }
         if poses is not None and poses.dim() == 4:
             expected["poses"] = (poses, (len(poses), num_joints, 3, 3))
-        for name, (value, shape) in expected.items():
-            if value is not None and value.shape != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
+        check_shapes(expected)
+        for name, (value, _) in expected.items():
             self.register_buffer(name, value, persistent=False)
         ancestry = parents.tolist()
         check_parents(ancestry)
@@ -230,6 +229,13 @@ def _check_tensor(value: Any, name: str) -> None:
     if not isinstance(value, Tensor):
         said = f"{value!r}" if isinstance(value, int) else type(value).__name__
         raise ValueError(f"{name} must be a batch, a tensor such as torch.tensor([3]), got {said}")
+
+
+def check_shapes(expected: Mapping[str, tuple[Tensor | None, tuple[int, ...]]]) -> None:
+    """Check that tensors, by name, have the shapes beside them; what is not there need not."""
+    for name, (value, shape) in expected.items():
+        if value is not None and value.shape != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
 
 
 def check_parents(parents: list[int]) -> None:

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from meshkit.data.rigged import check_parents
+from meshkit.data.rigged import check_parents, check_shapes
 
 __all__ = ["sample_bone_factors", "sample_identities", "sample_poses", "scale_bones"]
 
@@ -139,9 +139,7 @@ def scale_bones(
         "weights": (weights, (len(weights), number)),
         "factors": (factors, (batch, number, 3)),
     }
-    for name, (value, shape) in expected.items():
-        if value.shape != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
+    check_shapes(expected)
     ancestry = parents.tolist()
     check_parents(ancestry)
     moved = [joints[:, 0]]
@@ -178,13 +176,13 @@ def sample_bone_factors(
         raise ValueError(f"joints must have shape {(len(parents), 3)}, got {tuple(joints.shape)}")
     if count < 0 or not 0 <= spread < math.inf:
         raise ValueError(f"count and spread must not be negative, got {count} and {spread}")
-    check_parents(parents.tolist())
+    ancestry = parents.tolist()
+    check_parents(ancestry)
     # Joints may lie at one place, as those of a hand's fingers: what follows them tells them apart.
-    places = torch.stack([joints, _subtree_means(joints, parents.tolist())], 1)
-    mirrored = (
-        torch.cdist((places * joints.new_tensor([-1.0, 1.0, 1.0])).flatten(1), places.flatten(1)).argmin(1).tolist()
-    )
-    limbs = _limbs(parents.tolist())
+    places = torch.stack([joints, _subtree_means(joints, ancestry)], 1)
+    opposite = places * joints.new_tensor([-1.0, 1.0, 1.0])
+    mirrored = torch.cdist(opposite.flatten(1), places.flatten(1)).argmin(1).tolist()
+    limbs = _limbs(ancestry)
     same_joint = [min(joint, other) for joint, other in enumerate(mirrored)]
     same_limb = [min(limbs[joint], limbs[other]) for joint, other in enumerate(mirrored)]
     device = "cpu" if generator is None else generator.device

@@ -3,7 +3,9 @@
 from typing import Literal, get_args
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from meshkit._repr import settings
 
 Reduction = Literal["mean", "sum", "none"]
 
@@ -33,3 +35,16 @@ def reduce_samples(total: Tensor, count: Tensor | int, reduction: Reduction) -> 
         return total.mean()
     mean = total / (count.clamp_min(1) if isinstance(count, Tensor) else max(count, 1))
     return mean.mean() if reduction == "mean" else mean
+
+
+class ReducedLoss(nn.Module):
+    """A loss without any option but the reduction."""
+
+    def __init__(self, *, reduction: Reduction = "mean") -> None:
+        super().__init__()
+        check_reduction(reduction)
+        self.reduction: Reduction = reduction
+
+    def extra_repr(self) -> str:
+        """Options in the printed module."""
+        return settings(self, "reduction")

@@ -1,11 +1,10 @@
 """Edge length loss: squared lengths of the mesh edges."""
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from meshkit._connectivity import connectivity, edge_lengths
-from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
-from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
+from meshkit.losses._common import ReducedLoss, Reduction, at_least_float32, check_reduction, reduce_samples
 
 __all__ = ["EdgeLengthLoss", "edge_length_loss"]
 
@@ -55,7 +54,7 @@ def edge_length_loss(
     return reduce_samples(2 * total, 2 * count, reduction)
 
 
-class EdgeLengthLoss(nn.Module):
+class EdgeLengthLoss(ReducedLoss):
     """Module form of :func:`edge_length_loss`.
 
     Args:
@@ -69,15 +68,6 @@ class EdgeLengthLoss(nn.Module):
         >>> EdgeLengthLoss()(torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]]), torch.tensor([[0, 1, 2]])).item()
         1.3333333730697632
     """
-
-    def __init__(self, *, reduction: Reduction = "mean") -> None:
-        super().__init__()
-        check_reduction(reduction)
-        self.reduction = reduction
-
-    def extra_repr(self) -> str:
-        """Options in the printed module."""
-        return settings(self, "reduction")
 
     def forward(self, verts: Tensor, faces: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Return the loss, see :func:`edge_length_loss`."""

@@ -4,10 +4,9 @@ import math
 from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from meshkit._repr import settings
-from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
+from meshkit.losses._common import ReducedLoss, Reduction, at_least_float32, check_reduction, reduce_samples
 
 __all__ = ["MatchingLoss", "RowPlanLike", "matching_loss"]
 
@@ -87,7 +86,7 @@ def logarithm(entries: Tensor) -> Tensor:
     return torch.where(nothing, 1.0, entries).log().masked_fill(nothing, -torch.inf)
 
 
-class MatchingLoss(nn.Module):
+class MatchingLoss(ReducedLoss):
     """Module form of :func:`matching_loss`.
 
     Args:
@@ -100,15 +99,6 @@ class MatchingLoss(nn.Module):
         >>> MatchingLoss()(torch.full((1, 2, 4), 0.1), torch.tensor([[0, 3]]))  # log 4
         tensor(1.3863)
     """
-
-    def __init__(self, *, reduction: Reduction = "mean") -> None:
-        super().__init__()
-        check_reduction(reduction)
-        self.reduction = reduction
-
-    def extra_repr(self) -> str:
-        """Options in the printed module."""
-        return settings(self, "reduction")
 
     def forward(self, plan: Tensor | RowPlanLike, correspondence: Tensor) -> Tensor:
         """Return the loss, see :func:`matching_loss`."""

@@ -1,12 +1,11 @@
 """Normal consistency loss: neighbouring faces should point the same way."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from meshkit._connectivity import connectivity
-from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
-from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
+from meshkit.losses._common import ReducedLoss, Reduction, at_least_float32, check_reduction, reduce_samples
 
 __all__ = ["NormalConsistencyLoss", "normal_consistency_loss"]
 
@@ -69,7 +68,7 @@ def normal_consistency_loss(
     return reduce_samples(total, mesh.counts(real, mesh.hinge_counts, total), reduction)
 
 
-class NormalConsistencyLoss(nn.Module):
+class NormalConsistencyLoss(ReducedLoss):
     """Module form of :func:`normal_consistency_loss`.
 
     Args:
@@ -83,15 +82,6 @@ class NormalConsistencyLoss(nn.Module):
         >>> NormalConsistencyLoss()(flat, torch.tensor([[0, 1, 2], [0, 2, 3]]))
         tensor(0.)
     """
-
-    def __init__(self, *, reduction: Reduction = "mean") -> None:
-        super().__init__()
-        check_reduction(reduction)
-        self.reduction: Reduction = reduction
-
-    def extra_repr(self) -> str:
-        """Options in the printed module."""
-        return settings(self, "reduction")
 
     def forward(self, verts: Tensor, faces: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Return the loss, see :func:`normal_consistency_loss`."""

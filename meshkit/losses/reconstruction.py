@@ -1,11 +1,17 @@
 """Reconstruction loss: squared distance between corresponding vertices."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
-from meshkit.losses._common import Reduction, at_least_float32, check_reduction, check_same_shape, reduce_samples
+from meshkit.losses._common import (
+    ReducedLoss,
+    Reduction,
+    at_least_float32,
+    check_reduction,
+    check_same_shape,
+    reduce_samples,
+)
 
 __all__ = ["ReconstructionLoss", "reconstruction_loss"]
 
@@ -59,7 +65,7 @@ def reconstruction_loss(
     return reduce_samples(residual.square().sum((1, 2)), count, reduction)
 
 
-class ReconstructionLoss(nn.Module):
+class ReconstructionLoss(ReducedLoss):
     """Module form of :func:`reconstruction_loss`.
 
     Args:
@@ -72,15 +78,6 @@ class ReconstructionLoss(nn.Module):
         >>> ReconstructionLoss(reduction="none")(torch.zeros(2, 4, 3), torch.ones(2, 4, 3))
         tensor([1., 1.])
     """
-
-    def __init__(self, *, reduction: Reduction = "mean") -> None:
-        super().__init__()
-        check_reduction(reduction)
-        self.reduction = reduction
-
-    def extra_repr(self) -> str:
-        """Options in the printed module."""
-        return settings(self, "reduction")
 
     def forward(self, pred: Tensor, target: Tensor, *, mask: Tensor | None = None) -> Tensor:
         """Return the loss, see :func:`reconstruction_loss`."""
