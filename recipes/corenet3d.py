@@ -23,7 +23,8 @@ from _train import train
 from torch import Tensor
 
 from meshkit.data import PairBatch
-from meshkit.losses import edge_ratio_loss, matching_loss, reconstruction_loss
+from meshkit.losses import RowPlanLike, edge_ratio_loss, matching_loss, reconstruction_loss
+from meshkit.models import PoseTransferGenerator
 from meshkit.models.presets import PRESETS as MODELS
 
 
@@ -79,20 +80,39 @@ PRESETS = {
 }
 
 
+class Matching(torch.nn.Module):
+    """The matching of a generator alone: nothing is warped, and the blocks stay as they are."""
+
+    def __init__(self, generator: PoseTransferGenerator) -> None:
+        super().__init__()
+        self.generator = generator
+        generator.transfer.requires_grad_(False)
+
+    def forward(self, identity: Tensor, pose: Tensor, **known: Tensor | None) -> RowPlanLike:
+        """The plan between the meshes of a batch; known is what :func:`inputs` gives."""
+        masks = {name: mask for name, mask in known.items() if name.endswith("mask")}
+        features = [
+            self.generator.encode(verts, mask=known[f"{side}_mask"], descriptors=known[f"{side}_descriptors"])
+            for side, verts in (("identity", identity), ("pose", pose))
+        ]
+        return self.generator.match(*features, **masks)
+
+
 def build(cfg: Config) -> tuple[torch.nn.Module, torch.nn.Module]:
-    """The generator, which is trained as it is."""
+    """The generator, which is trained as it is, or its matching alone."""
     if not (cfg.lambda_rec or cfg.lambda_edge or cfg.lambda_match):
         raise UserError("nothing to learn: one of --lambda-rec, --lambda-edge and --lambda-match must not be 0")
     generator = cfg.model.build()
-    if not (cfg.lambda_rec or cfg.lambda_edge):
-        generator.transfer.requires_grad_(False)  # the matching alone learns
-    return generator, generator
+    return generator, generator if cfg.lambda_rec or cfg.lambda_edge else Matching(generator)
 
 
 def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float) -> dict[str, Tensor]:
     """The weighted losses of one step."""
     result = system(batch.identity, batch.pose, **inputs(batch))
-    output = result.vertices
+    if cfg.lambda_rec or cfg.lambda_edge:
+        output, _, plan = result
+    else:
+        plan = result
     losses = {}
     if cfg.lambda_rec:
         losses["rec"] = cfg.lambda_rec * reconstruction_loss(output, batch.ground_truth, mask=batch.identity_mask)
@@ -101,7 +121,7 @@ def step(system: torch.nn.Module, batch: PairBatch, cfg: Config, progress: float
     if cfg.lambda_match:
         if progress == 0 and not bool((batch.correspondence >= 0).any()):
             raise UserError(f"--lambda-match needs true matches, which --data {cfg.data} does not know: drop it")
-        losses["match"] = cfg.lambda_match * matching_loss(result.plan, batch.correspondence)
+        losses["match"] = cfg.lambda_match * matching_loss(plan, batch.correspondence)
     return losses
 
 

@@ -154,7 +154,8 @@ def sample_bone_factors(
 ) -> Tensor:
     r"""Factors for :func:`scale_bones`: limbs differ in length and girth, the same on the left and on the right.
 
-    .. math:: s_j = \exp\bigl(\sigma (a_{l(j)} + \tfrac12 b_j)\bigr), \qquad a, b \sim N(0, I_3)
+    .. math:: s_j = \exp\bigl(\sigma (c_{l(j)} + \tfrac12 a_{l(j)} + \tfrac12 b_j)\bigr), \qquad
+              a, b \sim N(0, I_3), \quad c \sim N(0, 1)
 
     where l(j) is the limb of joint j, as in :func:`sample_poses`. Joints and limbs that mirror one another in the plane
     x = 0 get the same numbers.
@@ -186,8 +187,9 @@ def sample_bone_factors(
     same_joint = [min(joint, other) for joint, other in enumerate(mirrored)]
     same_limb = [min(limbs[joint], limbs[other]) for joint, other in enumerate(mirrored)]
     device = "cpu" if generator is None else generator.device
-    drawn = torch.randn(2, count, len(parents), 3, generator=generator, device=device, dtype=joints.dtype).to(joints)
-    return (spread * (drawn[0, :, same_limb] + drawn[1, :, same_joint] / 2)).exp()
+    drawn = torch.randn(3, count, len(parents), 3, generator=generator, device=device, dtype=joints.dtype).to(joints)
+    whole, limb, joint = drawn[0, :, same_limb, :1], drawn[1, :, same_limb], drawn[2, :, same_joint]
+    return (spread * (whole + limb / 2 + joint / 2)).exp()
 
 
 def _subtree_means(joints: Tensor, parents: list[int]) -> Tensor:
