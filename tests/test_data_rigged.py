@@ -275,7 +275,7 @@ def test_bones_are_scaled_as_the_equation_says():
 
 
 def test_bone_factors_are_those_of_limbs_and_of_both_sides():
-    """Logarithms of mean 0; a limb's joints have variance 5/4 and covariance 1; left and right are the same."""
+    """Logarithms of mean 0; a limb's joints have variance 3/2, covariances 5/4 and, between axes, 1; sides are alike."""
     humans = load_humans(1000)
     factors = sample_bone_factors(humans.joints, humans.parents, 20_000, spread=0.3).double().log() / 0.3
     assert factors.mean((0, 2)).abs().max() < 0.03
@@ -283,8 +283,9 @@ def test_bone_factors_are_those_of_limbs_and_of_both_sides():
     assert humans.joints[[knee, other_knee], 0].sum().abs() < 1e-3
     assert torch.equal(factors[:, knee], factors[:, other_knee])
     assert not torch.equal(factors[:, knee], factors[:, ankle])
-    cov = torch.stack([factors[:, j, 2] for j in (knee, ankle, head)]).cov()
-    expected = torch.tensor([[1.25, 1.0, 0.0], [1.0, 1.25, 0.0], [0.0, 0.0, 1.25]], dtype=torch.float64)
+    cov = torch.stack([factors[:, knee, 2], factors[:, ankle, 2], factors[:, ankle, 0], factors[:, head, 2]]).cov()
+    alike = [[1.5, 1.25, 1.0, 0.0], [1.25, 1.5, 1.0, 0.0], [1.0, 1.0, 1.5, 0.0], [0.0, 0.0, 0.0, 1.5]]
+    expected = torch.tensor(alike, dtype=torch.float64)
     assert torch.allclose(cov, expected, atol=0.05)
     assert torch.equal(
         *(
