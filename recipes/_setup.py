@@ -35,7 +35,8 @@ def check(cfg: Any) -> None:
         "save_every",
     )
     if cfg.steps == 0 and cfg.init is None:
-        raise UserError("--steps 0 evaluates weights without training: say with --init which")
+        own = f" (this run's own: --init {cfg.out / cfg.name}, under another --name)" if cfg.resume else ""
+        raise UserError(f"--steps 0 evaluates weights without training: say with --init which{own}")
     for name in counts:
         value = getattr(cfg, name, None)
         least = 0 if name == "steps" else 1

@@ -508,6 +508,8 @@ def test_no_steps_report_what_the_weights_are_worth(run: Callable[..., Path]) ->
     assert (known.parent / "again" / "sheet.png").exists() and not (known.parent / "again" / "state.pt").exists()
     with pytest.raises(recipe_module("_run").UserError, match="--steps 0 evaluates weights without training: say"):
         run("npt", "--name", "third", "--steps", 0)
+    with pytest.raises(recipe_module("_run").UserError, match=r"this run's own: --init \S+run, under another --name"):
+        run("npt", "--steps", 0, "--resume")
 
 
 def test_no_steps_make_no_more_of_the_training_pool_than_a_pair(
