@@ -35,6 +35,7 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 myst_update_mathjax = False
 html_math_renderer = "mathtext_svg"
+highlight_language = "none"  # blocks that name no language are output, not Python
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
