@@ -55,6 +55,10 @@ def log_heat(verts: Tensor, faces: Tensor, **options) -> Tensor:
     return heat_kernel_signature(verts, faces, **options).log()
 
 
+def wide(verts: Tensor, faces: Tensor, **options) -> Tensor:
+    return wave_kernel_signature(verts, faces, width=7.0, **options)
+
+
 def narrow(verts: Tensor, faces: Tensor, **options) -> Tensor:
     return wave_kernel_signature(verts, faces, width=1.0, **options)
 
@@ -69,13 +73,13 @@ def fast(descriptor: Callable[..., Tensor], **options) -> Descriptor:
 
 # name -> descriptor, and the exact one it stands for
 TABLE: dict[str, tuple[Descriptor, str | None]] = {
-    "wave 16, width 7": (wave_kernel_signature, None),
-    "wave 16, width 7, fast": (fast(wave_kernel_signature), "wave 16, width 7"),
+    "wave 16, width 7": (wide, None),
+    "wave 16, width 7, fast": (fast(wide), "wave 16, width 7"),
     "wave 16, width 1": (narrow, None),
     "wave 16, width 1, fast": (fast(narrow), "wave 16, width 1"),
     "wave 16, width 1, fast, 48 pairs": (fast(narrow, num_eigenpairs=48), None),
     "wave 16, width 1, fast, 32 pairs": (fast(narrow, num_eigenpairs=32), None),
-    "wave 64, width 7": (lambda v, f: wave_kernel_signature(v, f, num_signatures=64), None),
+    "wave 64, width 7": (partial(wide, num_signatures=64), None),
     "log heat 16": (log_heat, None),
     "log heat 16, fast": (fast(log_heat), "log heat 16"),
     "log heat 16, fast, 32 pairs": (fast(log_heat, num_eigenpairs=32), None),
