@@ -69,7 +69,7 @@ def arap_deform(
         soft_targets: positions of the shape of `verts`, met as far as their weights ask. Differentiable.
         soft_weights: (V,) or (B, V) weights, dimensionless like cotangents, at least 0. Differentiable.
         energy: see :func:`arap_energy`.
-        method: "lbfgs", which reaches the energy of 50 local-global iterations in about 20 evaluations and goes on to
+        method: "lbfgs", which reaches the energy of 50 local-global iterations in about 15 evaluations and goes on to
             the minimum; or "local_global", which alternates the best rotations with the best positions.
         init: "rest" starts from the identity rotations of the rest shape; positions of the shape of `verts` start from
             the rotations that suit them once the handles are moved (detached).

@@ -136,7 +136,7 @@ def xdualnet(preset: str = "paper", *, released: bool = False) -> PoseTransferGe
         preset: ``"paper"`` (extractor 32/64/128 over 32 neighbours, blocks 1024/512/256), ``"tiny"`` (16/32/32 over 8
             neighbours, blocks 256/128/64 that displace the warped mesh, intrinsic descriptors at the extractor's input
             and as the blocks' condition), which trains on a laptop's CPU, or ``"small"``, that with an extractor
-            32/64/64 over 16 neighbours.
+            32/64/64 over 16 neighbours and Poisson deformation of the warped mesh.
         released: the released code's first convolution, of kernel 3 along the vertex order, and its matching. The
             model is then not permutation-equivariant.
 
