@@ -8,16 +8,20 @@ import importlib
 import inspect
 import pkgutil
 from pathlib import Path
+from textwrap import indent
 from typing import NamedTuple
+
+from sphinx.pycode import ModuleAnalyzer
 
 import meshkit
 
 
 class Entry(NamedTuple):
-    """A public name."""
+    """A public name, and the text below it that autodoc does not find by itself."""
 
     path: str
     directive: str
+    text: str = ""
 
 
 def modules(package) -> list[str]:
@@ -32,7 +36,18 @@ def entry(module: str, name: str) -> Entry:
         kind = "autoexception" if issubclass(value, Exception) else "autoclass"
     else:
         kind = "autofunction" if inspect.isroutine(value) else "autodata"
-    return Entry(f"{module}.{name}", kind)
+    return Entry(f"{module}.{name}", kind, comment(module, name) if kind == "autodata" else "")
+
+
+def comment(module: str, name: str) -> str:
+    """The string below a constant that a package lists and one of its modules defines; autodoc reads the package's."""
+    package = importlib.import_module(module)
+    for inner in modules(package) if hasattr(package, "__path__") else []:
+        lines = ModuleAnalyzer.for_module(inner)
+        lines.analyze()
+        if found := lines.attr_docs.get(("", name)):
+            return "\n".join(found).strip()
+    return ""
 
 
 def entries(component: str) -> tuple[list[Entry], list[Entry]]:
@@ -58,6 +73,7 @@ def page(component: str) -> str:
         for e in group:
             members = ["   :members:"] if e.directive in ("autoclass", "autoexception") else []
             lines += [f".. {e.directive}:: {e.path}", *members, ""]
+            lines += [indent(e.text, "   "), ""] if e.text else []
     return "\n".join(lines)
 
 
@@ -77,12 +93,12 @@ def write_pages(app) -> None:
             file.unlink()
 
 
-def skip_fields(app, what, name, obj, skip, options):
-    """Fields of named tuples are described by the class; their own docstring says only "Alias for field number"."""
-    return True if isinstance(obj, type(inspect.getattr_static(Entry, "path"))) else None
+def skip_members(app, what, name, obj, skip, options):
+    """Fields of named tuples, which say only "Alias for field number", and what only printing a module calls."""
+    return True if name == "extra_repr" or isinstance(obj, type(inspect.getattr_static(Entry, "path"))) else None
 
 
 def setup(app):
     app.connect("builder-inited", write_pages)
-    app.connect("autodoc-skip-member", skip_fields)
+    app.connect("autodoc-skip-member", skip_members)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
