@@ -23,6 +23,7 @@ def blocks(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
+PROSE = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 PAGES = [page.name for page in sorted(DOCS.glob("*.md")) if blocks(page) and page.name not in ELSEWHERE]
 
 
@@ -147,6 +148,45 @@ def test_files_that_pages_name_exist() -> None:
     named = [(page.name, file) for page in DOCS.glob("*.md") for file in pattern.findall(page.read_text())]
     assert len(named) > 40
     assert not [(page, file) for page, file in named if not (ROOT / file).exists()]
+
+
+# Options of pip and torchrun.
+FOREIGN = {"--no-build-isolation", "--nnodes", "--nproc-per-node", "--max-restarts"}
+FOREIGN |= {"--rdzv-backend", "--rdzv-endpoint"}
+
+
+def test_options_that_pages_name_exist() -> None:
+    """Those of the command, tools and benchmarks, which spell them out, and of recipes, whose options are fields."""
+    from meshkit._transfer_command import parser
+
+    files = [file for name in ("recipes", "tools", "benchmarks") for file in (ROOT / name).glob("*.py")]
+    text = "\n".join(file.read_text() for file in [*files, ROOT / "meshkit" / "models" / "presets.py"])
+    known = FOREIGN | set(re.findall(r'"(--[a-z][\w-]*)', text))
+    known |= set(re.findall(r"--[a-z][\w-]*", parser().format_help()))
+    for field in re.findall(r"^    (\w+): ", text, re.MULTILINE):
+        known |= {f"--{of}{field.replace('_', '-')}" for of in ("", "no-", "model.", "model.no-")}
+    pattern = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
+    named = [(page.name, flag) for page in PROSE for flag in pattern.findall(page.read_text())]
+    assert len(named) > 100
+    assert not [(page, flag) for page, flag in named if flag not in known]
+
+
+def test_readings_of_a_plan_that_its_page_names_exist() -> None:
+    from meshkit.ot import TransportPlan
+
+    named = re.findall(r"`plan\.(\w+)", (DOCS / "optimal_transport.md").read_text())
+    assert len(named) > 12 and all(hasattr(TransportPlan, name) for name in named)
+
+
+def test_blocks_that_do_not_run_are_python_and_use_what_there_is() -> None:
+    found = 0
+    for page in PROSE:
+        for block in re.findall(r"^```python no-run\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+            compile(block, page.name, "exec")
+            for module, names in re.findall(r"^from (meshkit[\w.]*) import (.*)$", block, re.MULTILINE):
+                assert all(hasattr(importlib.import_module(module), name) for name in names.split(", ")), block
+                found += 1
+    assert found >= 3
 
 
 def test_clean_removes_what_a_build_leaves() -> None:
