@@ -136,7 +136,9 @@ def test_corenet3d_may_keep_its_matching(batch: PairBatch) -> None:
     learning = {name.partition(".")[0] for name, p in generator.named_parameters() if p.grad is not None}
     assert learning == {"transfer"}
     npt = GeneratorConfig(architecture="npt_maxpool")
-    with pytest.raises(recipe_module("_run").UserError, match="npt_maxpool has no matching: recipes/npt.py trains it"):
+    with pytest.raises(
+        recipe_module("_run").UserError, match=r"npt_maxpool has no matching: recipes/npt\.py trains it"
+    ):
         recipe.build(replace(cfg, model=npt))
     for wrong in ({"init": None}, {"lambda_match": 1.0}):
         with pytest.raises(recipe_module("_run").UserError, match="--frozen-matching keeps the matching that --init"):
