@@ -40,6 +40,8 @@ class Config(Settings):
     """Weight of the edge loss (length ratios). Released code: 0.5."""
     lambda_match: float = 0.0
     """Weight of the likelihood of the true matches, which the data must know. Paper: 0, reconstruction alone."""
+    frozen_matching: bool = False
+    """The matching that --init brings stays as it is: the blocks alone learn."""
     norm: Literal["elain", "spadain"] | None = None
     """Conditional norm of the blocks, None for that of --model.norm; spadain is the paper's ablation of ElaIN."""
 
@@ -91,11 +93,11 @@ class Matching(torch.nn.Module):
     def forward(self, identity: Tensor, pose: Tensor, **known: Tensor | None) -> RowPlanLike:
         """The plan between the meshes of a batch; known is what :func:`inputs` gives."""
         masks = {name: mask for name, mask in known.items() if name.endswith("mask")}
-        features = [
+        first, second = (
             self.generator.encode(verts, mask=known[f"{side}_mask"], descriptors=known[f"{side}_descriptors"])
             for side, verts in (("identity", identity), ("pose", pose))
-        ]
-        return self.generator.match(*features, **masks)
+        )
+        return self.generator.match(first, second, **masks)
 
 
 def build(cfg: Config) -> tuple[torch.nn.Module, torch.nn.Module]:
@@ -103,6 +105,13 @@ def build(cfg: Config) -> tuple[torch.nn.Module, torch.nn.Module]:
     if not (cfg.lambda_rec or cfg.lambda_edge or cfg.lambda_match):
         raise UserError("nothing to learn: one of --lambda-rec, --lambda-edge and --lambda-match must not be 0")
     generator = cfg.model.build()
+    if not isinstance(generator, PoseTransferGenerator):
+        raise UserError(f"--model.architecture {cfg.model.architecture} has no matching: recipes/npt.py trains it")
+    if cfg.frozen_matching:
+        if cfg.lambda_match or cfg.init is None:
+            raise UserError("--frozen-matching keeps the matching that --init brings; it goes without --lambda-match")
+        for part in (generator.extractor, generator.theta, generator.phi):
+            part.requires_grad_(False)
     return generator, generator if cfg.lambda_rec or cfg.lambda_edge else Matching(generator)
 
 

@@ -275,7 +275,7 @@ def test_bones_are_scaled_as_the_equation_says():
 
 
 def test_bone_factors_are_those_of_limbs_and_of_both_sides():
-    """Logarithms of mean 0; a limb's joints have variance 3/2, covariances 5/4 and, between axes, 1; sides are alike."""
+    """Logarithms of mean 0; a limb's joints have variance 3/2, covariance 5/4, 1 between axes; sides are alike."""
     humans = load_humans(1000)
     factors = sample_bone_factors(humans.joints, humans.parents, 20_000, spread=0.3).double().log() / 0.3
     assert factors.mean((0, 2)).abs().max() < 0.03

@@ -128,6 +128,23 @@ def test_corenet3d_may_learn_the_matching_alone(batch: PairBatch) -> None:
         recipe.build(replace(cfg, lambda_match=0.0))
 
 
+def test_corenet3d_may_keep_its_matching(batch: PairBatch) -> None:
+    recipe = recipe_module("corenet3d")
+    cfg = replace(small(recipe), frozen_matching=True, init="first")
+    generator, system = recipe.build(cfg)
+    sum(recipe.step(system, batch, cfg, 0.0).values()).backward()
+    learning = {name.partition(".")[0] for name, p in generator.named_parameters() if p.grad is not None}
+    assert learning == {"transfer"}
+    npt = GeneratorConfig(architecture="npt_maxpool")
+    with pytest.raises(
+        recipe_module("_run").UserError, match=r"npt_maxpool has no matching: recipes/npt\.py trains it"
+    ):
+        recipe.build(replace(cfg, model=npt))
+    for wrong in ({"init": None}, {"lambda_match": 1.0}):
+        with pytest.raises(recipe_module("_run").UserError, match="--frozen-matching keeps the matching that --init"):
+            recipe.build(replace(cfg, **wrong))
+
+
 def test_corenet3d_for_a_time_without_descriptors(run: Any) -> None:
     folder = run("corenet3d", "--minutes", 0.02, *WITHOUT_DESCRIPTORS, *SMALL_EXTRACTOR, "--model.widths", 16, 8)
     steps = read_json(folder / "config.json")["steps"]
