@@ -96,7 +96,7 @@ def _knn_tree(points: Tensor, query: Tensor, k: int, mask: Tensor | None, includ
         index = torch.from_numpy(np.ascontiguousarray(index, dtype=np.int64))
         index = index if real is None else real[index]
         if not include_self:
-            surplus = index == torch.arange(len(index))[:, None]
+            surplus = index == torch.arange(len(index), device="cpu")[:, None]
             surplus[:, -1] |= ~surplus.any(1)  # among coincident points it need not have found itself
             index = index[~surplus].view(-1, k)
         rows.append(index)

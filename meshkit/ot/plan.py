@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from meshkit._compile import uncompiled
+from meshkit.ot.costs import number
 from meshkit.ot.sample import SamplePlan, pad_columns, spread
 from meshkit.ot.stacked import split
 
@@ -58,7 +59,7 @@ class TransportPlan:
 
     def __repr__(self) -> str:
         """Shape, type and regularisation."""
-        eps = float(torch.as_tensor(self._any.eps).detach())
+        eps = number(self._any.eps)
         return f"TransportPlan(shape={tuple(self.shape)}, dtype={self.dtype}, eps={eps:g}, n_iters={self.n_iters})"
 
     @property
@@ -269,7 +270,7 @@ class TransportPlan:
                 scores = sample.log_dense().double().nan_to_num(neginf=-1e300).cpu()
             scores = scores.mT if self._transposed else scores
             row, column = linear_sum_assignment(scores.numpy(), maximize=True)
-            matched = torch.full((len(scores),), -1)
+            matched = torch.full((len(scores),), -1, device="cpu")
             matched[torch.from_numpy(row)] = torch.from_numpy(column)
             positions = sample.index_x if self._transposed else sample.index_y
             if positions is not None:

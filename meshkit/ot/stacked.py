@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from meshkit._numerics import launch_bound
-from meshkit.ot.costs import logit_features
+from meshkit.ot.costs import logit_features, number
 from meshkit.ot.kernel import GibbsKernel, Ledger, full_precision, refuse_second_derivative
 from meshkit.ot.options import Options
 from meshkit.ot.sample import SamplePlan
@@ -54,8 +54,8 @@ def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, *given: Tenso
         return False
     if store == "auto" and batch * rows * columns * dtype.itemsize > STACK_BYTES:
         return False
-    eps = float(options.eps.detach() if isinstance(options.eps, Tensor) else options.eps)
-    return options.domain == "kernel" or 2 / eps <= math.log(torch.finfo(dtype).max) - math.log(rows * columns)
+    room = math.log(torch.finfo(dtype).max) - math.log(rows * columns)
+    return options.domain == "kernel" or 2 / number(options.eps) <= room
 
 
 def solve_stacked(x: Tensor, y: Tensor, options: Options) -> SamplePlan:
