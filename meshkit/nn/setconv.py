@@ -44,7 +44,8 @@ class SetConv(nn.Module):
             products; else one tensor ``(B, N k, out_features)`` is kept for the backward.
 
     Shape:
-        ``x (B, N, C)``, ``positions (B, N, 3)``, ``neighbors (B, N, k)`` int64; the result is ``(B, N, out_features)``.
+        ``x (B, N, C)``, ``positions (B, N, 3)``, ``neighbors (B, N, k)`` int64; the result is ``(B, N, out_features)``,
+        0 at padded vertices.
 
     Raises:
         ValueError: negative slope, no channels, or shapes that do not fit.
@@ -177,7 +178,7 @@ def _neighborhoods(positions: Tensor, neighbors: Tensor, mask: Tensor | None) ->
     else:
         real = mask[..., None].to(positions)
         positions = positions.masked_fill(~mask[..., None], 0.0)
-    count = real.sum(1, keepdim=True)
+    count = real.sum(1, keepdim=True).clamp_min(1)
     positions = (positions - positions.sum(1, keepdim=True) / count) * real
     rows = k * count
     relative = (gather_vertices(positions, neighbors) - positions[:, :, None]) * real[..., None]

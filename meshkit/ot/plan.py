@@ -215,18 +215,17 @@ class TransportPlan:
                 f"columns must be integers of shape (B, N) = {(batch, rows)}, got {columns.dtype} of "
                 f"{tuple(columns.shape)}"
             )
-        columns = torch.where(columns < 0, number, columns).long()
         found = []
         with torch.autocast(self.device.type, enabled=False):
-            for sample, wanted in zip(self._samples, columns, strict=True):
+            for sample, wanted in zip(self._samples, columns.long(), strict=True):
                 own, other = (sample.index_x, sample.index_y)[:: -1 if self._transposed else 1]
                 near = wanted if own is None else wanted[own]
                 if other is not None:  # from the padded batch's columns to those that have weight
-                    local = torch.full((number + 1,), -1, device=self.device)
+                    local = torch.full((number,), -1, device=self.device)
                     local[other] = torch.arange(len(other), device=self.device)
-                    near = local[near]
-                none = (near < 0) | (near == number)
-                values = sample.log_masses(near.masked_fill(none, 0)[:, None], not self._transposed)[:, 0]
+                    near = torch.where(near < 0, near, local[near.clamp_min(0)])
+                none = near < 0
+                values = sample.log_masses(near.clamp_min(0)[:, None], not self._transposed)[:, 0]
                 found.append(values.masked_fill(none, -torch.inf))
         return self._spread(found, over_rows=not self._transposed, empty=-torch.inf)
 
