@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from meshkit._compile import uncompiled
-from meshkit.ot.costs import logit_features
+from meshkit.ot.costs import logit_features, logits_per_cost
 from meshkit.ot.dual import iterate_between, iterate_within
 from meshkit.ot.iterations import iterate_kernel, iterate_log
 from meshkit.ot.kernel import GibbsKernel
@@ -226,7 +226,7 @@ def solve_cost(
             if options.settings.grad == "none":
                 matrix, sides = matrix.detach(), sides.detached()
             shift = float(matrix.detach().amin()) if matrix.numel() and not options.unbalanced else 0.0
-            logits = (shift - matrix) * (LOG2_E / options.eps)
+            logits = (shift - matrix) * logits_per_cost(options.eps, dtype)
             spread = float(logits.detach().abs().amax()) / LOG2_E if logits.numel() else 0.0
             chosen = "log" if start is not None else options.domain_for(spread, sides)
             first = None if start is None else LOG2_E * sides.rows_of(start[s].to(dtype))
