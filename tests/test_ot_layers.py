@@ -192,7 +192,8 @@ def test_divergence_of_points_that_are_not_finite_ends(bad):
     ("options", "message"),
     [
         ({"eps": 0.0}, "eps must be positive"),
-        ({"anneal": 1.0}, "0 < factor < 1"),
+        ({"anneal": 1.0}, "anneal must be between 0 and 1, or None to start at eps, got 1.0"),
+        ({"anneal": 1.5, "domain": "kernel"}, "anneal must be between 0 and 1"),
         ({"n_iters": 0}, "n_iters must be an integer of at least 1"),
         ({"cost": "l1"}, "cost must be one of"),
         ({"mask_x": torch.ones(1, 5, dtype=torch.bool)}, "mask_x must have shape"),

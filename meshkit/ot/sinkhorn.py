@@ -134,7 +134,7 @@ def solve_features(
     shape = len(fx), fx.shape[1], fy.shape[1]
     dtype = torch.promote_types(torch.promote_types(fx.dtype, fy.dtype), torch.float32)
     with torch.autocast(fx.device.type, enabled=False):
-        if not check_finite and stackable(fx, fy, cost, options, a, b, mask_x, mask_y):
+        if not check_finite and stackable(fx, fy, cost, options, dtype, a, b, mask_x, mask_y):
             return TransportPlan(solve_stacked(fx.to(dtype), fy.to(dtype), options), shape)
         like = fx.new_empty(0, dtype=dtype)
         keep = options.keep(math.prod(shape) * dtype.itemsize)

@@ -31,8 +31,10 @@ STACK_BYTES = 1 << 27
 """Kernels up to this size, all samples together, are stored by ``store="auto"``."""
 
 
-def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, *given: Tensor | None) -> bool:
+def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, dtype: torch.dtype, *given: Tensor | None) -> bool:
     """Whether :func:`solve_stacked` may take the problem; ``given`` are masks and weights, which must be missing.
+
+    It would work in ``dtype``.
 
     Only the cosine cost has a range that is known without a look at the features.
     """
@@ -49,7 +51,7 @@ def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, *given: Tenso
         or settings.grad not in ("unroll", "none")
     ):
         return False
-    (batch, rows, _), columns, dtype = fx.shape, fy.shape[1], torch.promote_types(fx.dtype, torch.float32)
+    (batch, rows, _), columns = fx.shape, fy.shape[1]
     if options.domain == "log" or store == "stream":
         return False
     if store == "auto" and batch * rows * columns * dtype.itemsize > STACK_BYTES:
