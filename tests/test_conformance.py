@@ -442,6 +442,23 @@ def test_autocast(name, monkeypatch):
 
 @CASES
 @pytest.mark.filterwarnings("ignore")
+def test_backward_started_within_autocast(name, monkeypatch):
+    """Where the block of the forward pass has not been left yet, as in many training loops."""
+    entry = ENTRIES[name]
+    monkeypatch.setitem(globals(), "DTYPE", torch.float32)
+    module, inputs = make(entry, dtype=torch.float32), entry.prepare(pair(entry, torch.float32))
+    wanted = {k: x.detach().requires_grad_() for k, x in inputs.items() if x is not None and x.is_floating_point()}
+    with torch.autocast("cpu", torch.bfloat16):
+        result = entry.result(module(**inputs | wanted)).float()
+        given = [result.square().sum(), [*wanted.values(), *module.parameters()]]
+        within = torch.autograd.grad(*given, allow_unused=True, retain_graph=True)
+    for gradient, expected in zip(within, torch.autograd.grad(*given, allow_unused=True), strict=True):
+        if expected is not None:
+            assert (gradient - expected).norm() <= entry.bf16 * expected.norm() + 1e-6
+
+
+@CASES
+@pytest.mark.filterwarnings("ignore")
 def test_compile(name):
     """Captured and run by the autograd-aware eager backend: same result and same gradients as without."""
     entry = ENTRIES[name]

@@ -15,9 +15,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from meshkit._numerics import launch_bound
+from meshkit._numerics import full_precision, launch_bound
 from meshkit.ot.costs import logit_features, number
-from meshkit.ot.kernel import GibbsKernel, Ledger, full_precision, refuse_second_derivative
+from meshkit.ot.kernel import GibbsKernel, Ledger, refuse_second_derivative
 from meshkit.ot.options import Options
 from meshkit.ot.sample import SamplePlan
 from meshkit.ot.tiles import LOG2_E, Factors, FeatureTiles, Reference, Tiles
