@@ -209,7 +209,7 @@ class TransportPlan:
             >>> plan.log_at(torch.tensor([[1, 2, -1]])).exp()  # a third each, the mass of a row
             tensor([[0.3333, 0.3333, 0.0000]])
         """
-        batch, rows, number = self.shape
+        batch, rows, size = self.shape
         if columns.shape != (batch, rows) or columns.dtype not in (torch.int64, torch.int32):
             raise ValueError(
                 f"columns must be integers of shape (B, N) = {(batch, rows)}, got {columns.dtype} of "
@@ -221,7 +221,7 @@ class TransportPlan:
                 own, other = (sample.index_x, sample.index_y)[:: -1 if self._transposed else 1]
                 near = wanted if own is None else wanted[own]
                 if other is not None:  # from the padded batch's columns to those that have weight
-                    local = torch.full((number,), -1, device=self.device)
+                    local = torch.full((size,), -1, device=self.device)
                     local[other] = torch.arange(len(other), device=self.device)
                     near = torch.where(near < 0, near, local[near.clamp_min(0)])
                 none = near < 0
