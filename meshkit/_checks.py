@@ -32,6 +32,23 @@ def check_channels(x: Tensor, channels: int, *, name: str = "x") -> None:
         raise ValueError(f"expected {name} with {channels} channels (B, N, {channels}), got {tuple(x.shape)}{hint}")
 
 
+def check_descriptors(descriptors: Tensor | None, positions: Tensor, channels: int) -> None:
+    """Check what comes beside positions ``(B, N, 3)``: descriptors of so many channels, or none for 0."""
+    if descriptors is not None:
+        check_features(descriptors, name="descriptors", layout="(B, N, D)")
+        if descriptors.shape[:2] != positions.shape[:2]:
+            raise ValueError(
+                f"descriptors (B, N, D) and positions (B, N, 3) must agree in B and N, got "
+                f"{tuple(descriptors.shape)} and {tuple(positions.shape)}"
+            )
+    given = 0 if descriptors is None else descriptors.shape[2]
+    if given != channels:
+        raise ValueError(
+            f"this extractor takes {channels} descriptor channels, got {given}"
+            + ("" if given else ": compute them with meshkit.descriptors.intrinsic_descriptors")
+        )
+
+
 def check_dtype(x: Tensor, module: nn.Module, *, name: str = "x") -> None:
     """Check that features and parameters have one dtype; autocast converts them itself."""
     own = next(module.parameters(), None)

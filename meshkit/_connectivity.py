@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from meshkit._compile import uncompiled
-from meshkit._numerics import safe_sqrt
+from meshkit._numerics import full_precision, safe_sqrt
 from meshkit.topology import check_faces
 
 
@@ -125,6 +125,7 @@ class _EdgeLengths(torch.autograd.Function):
         return length
 
     @staticmethod
+    @full_precision
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None, None]:
         x, edge, length = ctx.saved_tensors
         if torch.is_grad_enabled():  # for second derivatives the edges must be functions of the vertices

@@ -64,12 +64,14 @@ def knn(
     if query is not None and not include_self:
         raise ValueError("include_self=False is for the points among themselves: leave query out")
     check_mask(mask, *points.shape[:2])
-    fewest = points.shape[1] if mask is None else int(mask.sum(1).min()) if len(mask) else 0
+    fewest = points.shape[1] if mask is None or not len(mask) else int(mask.sum(1).min())
     if not 1 <= k <= fewest - (not include_self):
         raise ValueError(
             f"k={k} neighbours were asked for, but the smallest mesh of the batch has {fewest} vertices"
             f"{'' if include_self else ', itself included'}: use a smaller k or a larger mesh"
         )
+    if not len(points):
+        return torch.empty(0, (points if query is None else query).shape[1], k, dtype=torch.int64, device=points.device)
     dtype = torch.promote_types(points.dtype, torch.float32)
     points = points.detach().to(dtype)
     query = points if query is None else query.detach().to(dtype)
@@ -96,7 +98,7 @@ def _knn_tree(points: Tensor, query: Tensor, k: int, mask: Tensor | None, includ
         index = torch.from_numpy(np.ascontiguousarray(index, dtype=np.int64))
         index = index if real is None else real[index]
         if not include_self:
-            surplus = index == torch.arange(len(index))[:, None]
+            surplus = index == torch.arange(len(index), device="cpu")[:, None]
             surplus[:, -1] |= ~surplus.any(1)  # among coincident points it need not have found itself
             index = index[~surplus].view(-1, k)
         rows.append(index)

@@ -106,8 +106,7 @@ def vertex_adjacency(faces: Tensor, num_verts: int) -> Tensor:
     check_faces(faces, num_verts)
     edges = unique_edges(faces).T
     index = torch.cat([edges, edges.flip(0)], 1)
-    ones = torch.ones(index.shape[1], device=faces.device)
-    return torch.sparse_coo_tensor(index, ones, (num_verts, num_verts), check_invariants=False).coalesce()
+    return _sparse(index, torch.ones(index.shape[1], device=faces.device), num_verts)
 
 
 def connected_components(faces: Tensor, num_verts: int) -> Tensor:
@@ -136,7 +135,7 @@ def connected_components(faces: Tensor, num_verts: int) -> Tensor:
     tail, head = np.concatenate([corners[:, 0], corners[:, 1]]), np.concatenate([corners[:, 1], corners[:, 2]])
     graph = coo_array((np.ones(len(tail), dtype=np.int8), (tail, head)), shape=(num_verts, num_verts))
     labels = csgraph.connected_components(graph.tocsr(), directed=False)[1]
-    return torch.as_tensor(labels, dtype=torch.int64).to(faces.device)
+    return torch.from_numpy(labels).long().to(faces.device)
 
 
 def cotangent_weights(verts: Tensor, faces: Tensor) -> Tensor:
@@ -201,8 +200,7 @@ def cotangent_laplacian(verts: Tensor, faces: Tensor) -> Tensor:
     faces, weights = faces[real].long(), weights[real]
     i, j, w = faces[:, [1, 2, 0]].flatten(), faces[:, [2, 0, 1]].flatten(), weights.flatten()
     index = torch.stack([torch.cat([i, j, i, j]), torch.cat([j, i, i, j])])
-    size = (len(verts), len(verts))
-    return torch.sparse_coo_tensor(index, torch.cat([-w, -w, w, w]), size, check_invariants=False).coalesce()
+    return _sparse(index, torch.cat([-w, -w, w, w]), len(verts))
 
 
 def mass_matrix(verts: Tensor, faces: Tensor, *, kind: str = "voronoi") -> Tensor:
@@ -306,6 +304,12 @@ def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
     squared = summed.square().sum(-1, keepdim=True)
     positive = squared > 0
     return torch.where(positive, summed / torch.where(positive, squared, 1.0).sqrt(), 0.0)
+
+
+def _sparse(index: Tensor, values: Tensor, size: int) -> Tensor:
+    """Square matrix of entries that are summed where they meet."""
+    place = values.device
+    return torch.sparse_coo_tensor(index, values, (size, size), device=place, check_invariants=False).coalesce()
 
 
 def _check(verts: Tensor, faces: Tensor) -> None:

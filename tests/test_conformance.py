@@ -442,6 +442,23 @@ def test_autocast(name, monkeypatch):
 
 @CASES
 @pytest.mark.filterwarnings("ignore")
+def test_backward_started_within_autocast(name, monkeypatch):
+    """Where the block of the forward pass has not been left yet, as in many training loops."""
+    entry = ENTRIES[name]
+    monkeypatch.setitem(globals(), "DTYPE", torch.float32)
+    module, inputs = make(entry, dtype=torch.float32), entry.prepare(pair(entry, torch.float32))
+    wanted = {k: x.detach().requires_grad_() for k, x in inputs.items() if x is not None and x.is_floating_point()}
+    with torch.autocast("cpu", torch.bfloat16):
+        result = entry.result(module(**inputs | wanted)).float()
+        given = [result.square().sum(), [*wanted.values(), *module.parameters()]]
+        within = torch.autograd.grad(*given, allow_unused=True, retain_graph=True)
+    for gradient, expected in zip(within, torch.autograd.grad(*given, allow_unused=True), strict=True):
+        if expected is not None:
+            assert (gradient - expected).norm() <= entry.bf16 * expected.norm() + 1e-6
+
+
+@CASES
+@pytest.mark.filterwarnings("ignore")
 def test_compile(name):
     """Captured and run by the autograd-aware eager backend: same result and same gradients as without."""
     entry = ENTRIES[name]
@@ -561,14 +578,24 @@ def test_gradient_reaches_every_parameter(name):
 
 
 @CASES
+@pytest.mark.filterwarnings("ignore")
 def test_no_tensor_is_made_on_the_default_device(name):
     """With another default device, everything still happens where the inputs are."""
     entry = ENTRIES[name]
     module, inputs = make(entry), entry.prepare(pair(entry))
-    expected = entry.result(module(**inputs))
-    with torch.device("meta"):
-        result = entry.result(module(**inputs))
-    assert result.device.type == "cpu" and torch.equal(result, expected)
+    wanted = {
+        k: x.detach().clone().requires_grad_() for k, x in inputs.items() if x is not None and x.is_floating_point()
+    }
+
+    def run() -> list[Tensor | None]:
+        result = entry.result(module(**inputs | wanted))
+        return [result, *torch.autograd.grad(result.square().sum(), [*wanted.values()], allow_unused=True)]
+
+    with torch.device("meta"):  # first: what is kept between calls must be right as well
+        results = run()
+    expected = run()
+    for result, value in zip(results, expected, strict=True):
+        assert value is None or (result.device.type == "cpu" and torch.equal(result, value))
 
 
 @CASES

@@ -292,6 +292,18 @@ def test_cycle_gradient(stop_gradient):
         assert gradient.item() == pytest.approx((expected * upstream).sum().item(), rel=1e-12)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_generators_of_half_precision(dtype):
+    """They give float32, and take what they gave all the same."""
+    net = PoseTransferGenerator(extractor_widths=(4, 6), k=4, widths=(12, 8)).to(dtype)
+    a, b = rand(2, 9, 3, dtype=dtype), rand(2, 7, 3, seed=1, dtype=dtype)
+    for wrapper in (DualReconstruction(net), CycleReconstruction(net)):
+        result = wrapper(a, b)
+        loss = result.reconstruction_a.square().mean() + result.reconstruction_b.square().mean()
+        gradients = torch.autograd.grad(loss, list(net.transfer.parameters()))
+        assert loss.isfinite() and all(gradient.isfinite().all() for gradient in gradients)
+
+
 def test_self_reconstruction():
     generator, mask, descriptors = Encoding(), scattered_mask([5, 7], 7), rand(2, 7, 4)
     result = SelfReconstruction(generator)(A, mask=mask, descriptors=descriptors)

@@ -75,21 +75,35 @@ def both(device: str, inputs: dict[str, Any], **options: Any) -> list[tuple[torc
 # ---------------------------------------------------------------- parts
 
 
-def test_meshes_of_any_strides() -> None:
-    """Columns side by side, as of a tensor that was transposed; on the way that CUDA tensors take as well."""
+def transposed(x: torch.Tensor) -> torch.Tensor:
+    """The same values in another order of memory: columns side by side, meshes interleaved."""
+    order = list(range(x.dim()))[::-1]
+    return x.permute(order).contiguous().permute(order)
+
+
+@pytest.mark.parametrize("solver", ["splu", "dense"])  # the latter is the way that CUDA tensors take
+@pytest.mark.parametrize("batch", [0, 1, 2])
+@pytest.mark.parametrize("options", [{}, UNROLL], ids=["implicit", "unroll"])
+def test_strides_change_no_bit(options: dict[str, Any], batch: int, solver: str) -> None:
     verts, faces = grid(4, 0)
-    handles = torch.tensor([0, 3, len(verts) - 1])
-    strided = verts.T.contiguous().T
-    assert not strided.is_contiguous()
+    verts = torch.cat([verts, rand(1, 3)])  # a vertex of no face, which the mask takes out
+    verts = torch.stack([verts, 1.1 * verts])[:batch] if batch else verts
+    handles, mask = torch.tensor([0, 3, 15]), torch.ones(verts.shape[:-1], dtype=torch.bool)
+    mask[..., 16] = False
+    weights = 0.1 * rand(*verts.shape[:-1], seed=4).square()
     found = []
-    for x in (verts, strided):
-        x = x.detach().requires_grad_()
-        bent, _ = arap_deform(x, faces, handles, x.detach()[handles] + 0.1, init=x.detach() * 1.01, solver="dense")
-        upstream = torch.arange(3.0, dtype=bent.dtype).expand(len(bent), 3)
-        upstream = upstream.contiguous() if x.is_contiguous() else upstream.T.contiguous().T
-        found.append((bent.detach(), torch.autograd.grad(bent, x, upstream)[0]))
+    for order in (torch.clone, transposed):
+        x, goal, soft, w = (
+            order(t).requires_grad_() for t in (verts, verts[..., handles, :] + 0.1, verts + 0.2, weights)
+        )
+        if "grad" in options:
+            x, w = x.detach(), w.detach()
+        more: dict[str, Any] = {"init": order(verts * 1.01), "mask": order(mask), "solver": solver}
+        bent, _ = arap_deform(x, faces, handles, goal, soft_targets=soft, soft_weights=w, **more, **options)
+        wanted = [t for t in (x, goal, soft, w) if t.requires_grad]
+        found.append([bent.detach(), *torch.autograd.grad(bent, wanted, order(rand(*bent.shape, seed=5)))])
     for a, b in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7)
+        assert torch.equal(a, b)
 
 
 @ON_DEVICES

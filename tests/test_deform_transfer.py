@@ -198,6 +198,10 @@ LOOSE = torch.cat([SOURCE, SOURCE[:1]])
         ({"source_posed": SOURCE[:, :2]}, r"source_posed must be a floating \(V, 3\) or \(P, V, 3\) tensor, got"),
         ({"source_posed": SOURCE[:-1]}, r"source_posed \(11, 3\) must have the 12 vertices of source_rest"),
         ({"target_rest": SOURCE * torch.nan}, "target_rest holds NaN or infinity"),
+        (
+            {"target_rest": SOURCE[:0], "target_faces": FACES[:0], "correspondence": INDEX[:0]},
+            r"target_rest \(0, 3\) holds no vertex",
+        ),
         ({"target_rest": LOOSE}, "target_rest has 13 vertices and source_rest 12: .* need target_faces"),
         ({"faces": FACES + 1}, r"\[0, 12\) .* got a range of \[1, 12\]"),
         ({"target_faces": FACES}, "belong together; correspondence is missing"),

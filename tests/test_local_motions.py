@@ -206,6 +206,14 @@ def test_errors(arguments: tuple, message: str, deform: Any) -> None:
         deform(rest, target, radius=radius)
 
 
+@pytest.mark.parametrize("shape", [(2, 1, 5), (1, 4, 5), (2, 5, 5), (4, 5), (2, 4, 0)])
+@BOTH
+def test_features_belong_to_the_vertices(shape: tuple[int, ...], deform: Any) -> None:
+    rest = rand(2, 4, 3)
+    with pytest.raises(ValueError, match=r"features must be \(2, 4, D\) beside rest, got"):
+        deform(rest, rest, radius=1.0, features=torch.zeros(shape))
+
+
 def test_a_weight_must_be_positive() -> None:
     for weight in (0.0, float("inf"), float("nan")):
         with pytest.raises(ValueError, match=f"weight must be positive and finite, got {weight}"):

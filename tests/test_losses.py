@@ -436,6 +436,14 @@ def test_backward_runs_in_full_precision_under_autocast():
         assert lifted.dtype == torch.float32
 
 
+def test_matrix_form_goes_back_in_full_precision_from_within_autocast():
+    plan, pose = rand(1, 8, 6).exp().float().requires_grad_(), rand(1, 6, 3).float()
+    with torch.autocast("cpu", torch.bfloat16):
+        value = backward_correspondence_loss(plan, pose, form="matrix", normalization="none")
+        (within,) = torch.autograd.grad(value, plan, retain_graph=True)
+    assert torch.equal(within, torch.autograd.grad(value, plan)[0])
+
+
 @normalizations
 @reductions
 @pytest.mark.parametrize("shape", [(7, 4), (4, 7), (5, 5)])

@@ -390,6 +390,10 @@ NONE = torch.zeros(2, 5, dtype=torch.bool)
         (lambda: ChamferLoss(reduction="avg"), "reduction"),
         (lambda: SinkhornDivergenceLoss(reduction="sum"), r"reduction must be one of \('mean', 'none'\).*'sum'"),
         (lambda: ARAPEnergyLoss(reduction="sum"), "reduction must be one of"),
+        (lambda: ARAPEnergyLoss(energy="springs"), "energy must be one of .* got 'springs'"),
+        (lambda: SinkhornDivergenceLoss(eps=0.0), "eps must be positive"),
+        (lambda: SinkhornDivergenceLoss(n_iters=0), "n_iters must be an integer of at least 1"),
+        (lambda: SinkhornDivergenceLoss(anneal=1.0), "anneal must be between 0 and 1"),
     ],
 )
 def test_errors(call, match):

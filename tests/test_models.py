@@ -264,6 +264,17 @@ def test_pointwise_errors():
         net(torch.zeros(5, 3))
     with pytest.raises(ValueError, match="mask must have shape"):
         net(torch.zeros(1, 5, 3), descriptors=torch.zeros(1, 5, 1), mask=torch.ones(1, 4, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"must agree in B and N, got \(1, 4, 1\) and \(1, 5, 3\)"):
+        net(torch.zeros(1, 5, 3), descriptors=torch.zeros(1, 4, 1))
+    with pytest.raises(ValueError, match=r"descriptors must have shape \(B, N, D\), got \(5, 1\)"):
+        net(torch.zeros(1, 5, 3), descriptors=torch.zeros(5, 1))
+    with pytest.raises(TypeError, match=r"positions is torch.float64, but the parameters .* are torch.float32"):
+        net(torch.zeros(1, 5, 3).double(), descriptors=torch.zeros(1, 5, 1))
+    for widths in ((), (4, 0)):
+        with pytest.raises(ValueError, match="widths must be at least one positive number of channels"):
+            PointwiseExtractor(widths)
+    with pytest.raises(ValueError, match="blocks must not be negative, got -1"):
+        PointwiseExtractor((4,), blocks=-1)
     with pytest.raises(ValueError, match='extractor must be "setconv" or "pointwise", got \'dgcnn\''):
         PoseTransferGenerator(extractor="dgcnn")
 

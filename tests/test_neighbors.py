@@ -147,6 +147,15 @@ def test_knn_errors(points, k, options, message):
         knn(torch.ones(points), k, **options)
 
 
+@pytest.mark.parametrize("method", ["auto", "tree", "tiles"])
+def test_no_samples(method):
+    points, mask = torch.zeros(0, 5, 3), torch.ones(0, 5, dtype=torch.bool)
+    assert knn(points, 2, method=method).shape == knn(points, 2, mask=mask, method=method).shape == (0, 5, 2)
+    assert knn(points, 2, query=torch.zeros(0, 7, 3), method=method).shape == (0, 7, 2)
+    with pytest.raises(ValueError, match="k=6"):
+        knn(points, 6, mask=mask, method=method)
+
+
 # Gathering
 
 

@@ -146,6 +146,31 @@ def test_setconv_padded_batch_equals_the_loop(garbage, recompute, block):
         assert_near(gradient, truth, 1e-10)
 
 
+@recompute
+@pytest.mark.parametrize("relative_gradient", [False, True])
+def test_a_sample_without_real_vertices_is_zero_and_leaves_the_others_alone(recompute, relative_gradient):
+    conv = randomise(SetConv(4, 6, recompute=recompute, relative_gradient=relative_gradient).double())
+    x, p = rand(2, 12, 4).requires_grad_(), rand(2, 12, 3, seed=1).requires_grad_()
+    neighbors, mask = knn(p, K), torch.tensor([[True], [False]]).expand(2, 12)
+    value = conv(x, p, neighbors, mask=mask)
+    alone = conv(x[:1], p[:1], neighbors[:1])
+    assert_near(value[:1], alone, 1e-13)
+    assert (value[1] == 0).all()
+    wanted, upstream = [x, *conv.parameters(), *[p] * relative_gradient], rand(*value.shape, seed=2)
+    truths = torch.autograd.grad(alone, wanted, upstream[:1])
+    for gradient, truth in zip(torch.autograd.grad(value, wanted, upstream), truths, strict=True):
+        assert_near(gradient, truth, 1e-11)
+
+
+def test_no_samples():
+    extractor = SetConvExtractor((5, 6), k=K)
+    empty = torch.zeros(0, 9, 3, requires_grad=True)
+    for mask in (None, torch.ones(0, 9, dtype=torch.bool)):
+        value = extractor(empty, mask=mask)
+        assert value.shape == (0, 9, 6)
+        assert all((gradient == 0).all() for gradient in gradients(value, [empty, *extractor.parameters()]))
+
+
 def test_setconv_is_the_same_in_training_and_evaluation():
     """Statistics are those of the sample, never running ones, and do not mix the samples of a batch."""
     conv = randomise(SetConv(3, 4).double())

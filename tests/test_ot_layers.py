@@ -20,6 +20,7 @@ from meshkit.ot import (
     log_optimal_transport,
     sinkhorn,
     sinkhorn_divergence,
+    sinkhorn_from_cost,
 )
 
 # Sinkhorn divergence
@@ -191,7 +192,8 @@ def test_divergence_of_points_that_are_not_finite_ends(bad):
     ("options", "message"),
     [
         ({"eps": 0.0}, "eps must be positive"),
-        ({"anneal": 1.0}, "0 < factor < 1"),
+        ({"anneal": 1.0}, "anneal must be between 0 and 1, or None to start at eps, got 1.0"),
+        ({"anneal": 1.5, "domain": "kernel"}, "anneal must be between 0 and 1"),
         ({"n_iters": 0}, "n_iters must be an integer of at least 1"),
         ({"cost": "l1"}, "cost must be one of"),
         ({"mask_x": torch.ones(1, 5, dtype=torch.bool)}, "mask_x must have shape"),
@@ -319,6 +321,18 @@ def test_correspondence_passes_its_options_on():
     assert_near(plan.dense(), sinkhorn(fx, fy, a=a, b=b).dense(), 1e-14)
     leaf = fx.clone().requires_grad_()
     assert not SinkhornCorrespondence(grad="none")(leaf, fy).dense().requires_grad
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float32])
+@pytest.mark.parametrize("cost", ["cosine", "sqeuclidean", "dot"])
+def test_eps_of_low_precision_is_taken_at_its_value(cost, dtype):
+    """As in a module cast to half precision: the plan is that of the rounded eps, and of no other."""
+    x, y, eps = rand(2, 6, 3), rand(2, 5, 3, seed=1), torch.tensor(0.3).to(dtype)
+    kinds = [sinkhorn(x, y, cost=cost, eps=e) for e in (eps, float(eps))]
+    kinds += [sinkhorn_from_cost(torch.cdist(x, y), eps=e) for e in (eps, float(eps))]
+    for given, plain in (kinds[:2], kinds[2:]):
+        assert_near(given.log_dense(), plain.log_dense(), 1e-12)
+        assert_near(given.cost(), plain.cost(), 1e-12)
 
 
 def test_learned_eps():

@@ -577,6 +577,14 @@ def test_log_at_reads_single_entries(transposed, padded):
     assert_near(found.nan_to_num(neginf=0.0), expected.nan_to_num(neginf=0.0), 1e-12)
 
 
+@pytest.mark.parametrize("options", [{}, {"mask_y": torch.tensor([[True] * 5 + [False]] * 2)}], ids=["", "mask"])
+@pytest.mark.parametrize("column", [6, 7])
+def test_log_at_refuses_columns_that_are_not_there(column, options):
+    plan = sinkhorn(rand(2, 4, 3), rand(2, 6, 3, seed=1), **options)
+    with pytest.raises(IndexError):
+        plan.log_at(torch.full((2, 4), column))
+
+
 @pytest.mark.parametrize("columns", [torch.zeros(2, 5, dtype=torch.int64), torch.zeros(2, 4)])
 def test_log_at_errors(columns):
     plan = sinkhorn(rand(2, 4, 3), rand(2, 6, 3, seed=1))

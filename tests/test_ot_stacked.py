@@ -112,6 +112,15 @@ def test_small_samples_are_solved_together_on_the_cpu_too():
     assert is_stacked(sinkhorn(large[:, :252], large)) and not is_stacked(sinkhorn(large, large))
 
 
+def test_samples_are_solved_together_up_to_a_size_in_the_dtype_of_the_plan(monkeypatch):
+    """That of the wider features: float64 on either side doubles what is stored."""
+    x, y = rand(2, 10, 3, dtype=torch.float32), rand(2, 10, 3, seed=1)
+    for size, together in ((1599, False), (1600, True)):
+        monkeypatch.setattr(stacked, "STACK_BYTES", size)
+        for first, second in ((x, y), (y, x)):
+            assert isinstance(sinkhorn(first, second, eps=0.3)._given, SamplePlan) == together
+
+
 def test_detached_plan_is_a_constant_without_a_stored_kernel(monkeypatch):
     fx, fy, v = rand(2, 9, 4), rand(2, 6, 4, seed=1), rand(2, 6, 3, seed=2)
     for small in (stacked.SMALL, 0):

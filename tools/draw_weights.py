@@ -24,8 +24,13 @@ ROWS = (  # weights, body, rows of the list of test pairs
 
 WARPED = (11, 22)  # rows whose warps differ
 WAYS = {"matching's means": (None, None), "rigid MLS": (0.25, None), "Poisson": (0.15, 0.2)}  # radius, weight
-EXCHANGED = (62, 48, 83)  # rows where xdualnet-humans takes one lower leg for the other
-TAILS = (195, 351)  # rows where xdualnet-animals takes the fox's tail for a leg
+HUMANS, ANIMALS = ("xdualnet-humans", "humans"), ("xdualnet-animals", "animals")
+MATCHED = (  # file, weights, body, rows, symmetry by title, view
+    # one lower leg is taken for the other
+    ("exchanged_limbs", *HUMANS, (62, 48, 83), {"as matched": False, "symmetry": True}, {"size": (240, 240)}),
+    # the fox's tail is taken for a leg
+    ("tails", *ANIMALS, (195, 351), {"output": False}, {"size": (260, 220), "azimuth": 70}),
+)
 
 
 def load_pair(body, row):
@@ -67,24 +72,24 @@ def draw_weights() -> None:
 
 
 @torch.no_grad()
-def draw_exchanged_limbs() -> None:
-    net, (body, split) = load_pretrained("xdualnet-humans"), load_shipped("humans")
+def draw_matched(name: str, weights: str, kind: str, rows, ways, view) -> None:
+    """Which vertices were taken for each other, and what came of it, with and without symmetry."""
+    net, (body, split) = load_pretrained(weights), load_shipped(kind)
     pictures, captions = [], []
-    for row in EXCHANGED:
+    for row in rows:
         identity, pose, truth = load_pair(body, split.test_pairs[row])
         results = []
-        for symmetry in (False, True):
-            net.generator.symmetry = symmetry
+        for net.generator.symmetry in ways.values():
             results.append(net.output(identity, pose, identity_faces=body.faces, pose_faces=body.faces))
         colors = position_colors(pose[0])
         meshes, bounds = together([identity, pose, *(r.vertices for r in results), truth])
-        painted = [colors[results[0].plan.argmax()[0]], colors, None, None, None]
+        painted = [colors[results[0].plan.argmax()[0]], colors, *[None] * len(ways), None]
         views = zip(meshes, painted, strict=True)
-        pictures.append([render(v, body.faces, colors=c, bounds=bounds, size=(240, 240)) for v, c in views])
-        captions.append(["matched places", "", score(meshes[2], meshes[4]), score(meshes[3], meshes[4]), ""])
-    titles = ["identity", "pose", "as matched", "symmetry", "ground truth"]
+        pictures.append([render(v, body.faces, colors=c, bounds=bounds, **view) for v, c in views])
+        captions.append(["matched places", "", *(score(v, meshes[-1]) for v in meshes[2:-1]), ""])
+    titles = ["identity", "pose", *ways, "ground truth"]
     sheet = contact_sheet(pictures, column_titles=titles, captions=captions)
-    sheet.quantize(255).save(IMAGES / "exchanged_limbs.png", optimize=True)
+    sheet.quantize(255).save(IMAGES / f"{name}.png", optimize=True)
 
 
 @torch.no_grad()
@@ -106,26 +111,8 @@ def draw_warps() -> None:
     )
 
 
-@torch.no_grad()
-def draw_tails() -> None:
-    net, (body, split) = load_pretrained("xdualnet-animals"), load_shipped("animals")
-    pictures, captions = [], []
-    for row in TAILS:
-        identity, pose, truth = load_pair(body, split.test_pairs[row])
-        result = net.output(identity, pose, identity_faces=body.faces, pose_faces=body.faces)
-        colors = position_colors(pose[0])
-        meshes, bounds = together([identity, pose, result.vertices, truth])
-        painted = [colors[result.plan.argmax()[0]], colors, None, None]
-        views = zip(meshes, painted, strict=True)
-        pictures.append([render(v, body.faces, colors=c, bounds=bounds, size=(260, 220), azimuth=70) for v, c in views])
-        captions.append(["matched places", "", score(meshes[2], meshes[3]), ""])
-    titles = ["identity", "pose", "output", "ground truth"]
-    sheet = contact_sheet(pictures, column_titles=titles, captions=captions)
-    sheet.quantize(255).save(IMAGES / "tails.png", optimize=True)
-
-
 if __name__ == "__main__":
     draw_weights()
-    draw_exchanged_limbs()
     draw_warps()
-    draw_tails()
+    for picture in MATCHED:
+        draw_matched(*picture)

@@ -24,8 +24,11 @@ class Mesh(NamedTuple):
         return self._replace(features=generator.encode(self.verts, mask=self.mask, descriptors=self.descriptors))
 
     def moved(self, verts: Tensor) -> Mesh:
-        """The same meshes at other positions; descriptors go along as constants."""
-        return Mesh(verts, self.mask, None if self.descriptors is None else self.descriptors.detach())
+        """The same meshes at other positions, in their dtype; descriptors go along as constants."""
+        # A generator of half precision may give float32, which it does not take itself.
+        return Mesh(
+            verts.to(self.verts.dtype), self.mask, None if self.descriptors is None else self.descriptors.detach()
+        )
 
     def subset(self, index: Tensor | None) -> Mesh:
         """The vertices ``(B, n)``."""

@@ -28,7 +28,7 @@ class BatchedFactor:
     def __init__(self, rest: BatchedRest, free: Tensor, soft: Tensor | None, solver: str) -> None:
         batch, size = free.shape
         self.rest, self.free = rest, free.view(-1, 1)
-        self.soft = None if soft is None else soft.reshape(-1, 1)
+        self.soft = None if soft is None else soft.view(-1, 1)
         rows, cols, values = rest.rows, rest.cols, rest.values
         if self.soft is not None:
             values = values + torch.where(rows == cols, self.soft[rows, 0], 0.0)

@@ -57,7 +57,7 @@ class BatchedObjective(Objective):
 
     def dot(self, a: Tensor, b: Tensor) -> Tensor:
         """Inner product (B,) of vectors, for each mesh."""
-        return (a * b).reshape(self.rest.batch, -1).sum(1)
+        return (a * b).view(self.rest.batch, -1).sum(1)
 
     def spread(self, values: Tensor) -> Tensor:
         """Values (B,) per mesh as a column (V, 1)."""

@@ -118,7 +118,7 @@ def column_solver(matrix: Tensor, inverse: Tensor, *, batch: int, look: int = 16
             matrix.matmul,
             inverse.mul,
             right,
-            dot=lambda a, b: (a * b).reshape(batch, size, 3).sum(1),
+            dot=lambda a, b: (a * b).view(batch, size, 3).sum(1),
             spread=lambda values: values.repeat_interleave(size, 0),
             tol=1e-10,
             max_iter=10 * size,

@@ -106,10 +106,12 @@ def key_point_correspondence(
 
 
 def check_points(points: Tensor, name: str, *, batched: bool = False) -> None:
-    """Raise ValueError unless points are finite and floating, (V, 3) or also (P, V, 3)."""
+    """Raise ValueError unless points are finite and floating, (V, 3) with V > 0, or also (P, V, 3)."""
     if points.dim() not in ((2, 3) if batched else (2,)) or points.shape[-1] != 3 or not points.is_floating_point():
         wanted = "(V, 3) or (P, V, 3)" if batched else "(V, 3)"
         raise ValueError(f"{name} must be a floating {wanted} tensor, got {points.dtype} {tuple(points.shape)}")
+    if points.shape[-2] == 0:
+        raise ValueError(f"{name} {tuple(points.shape)} holds no vertex")
     if not torch.isfinite(points).all():
         raise ValueError(f"{name} holds NaN or infinity")
 

@@ -49,6 +49,7 @@ class ImplicitMinimum(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Solve for the adjoint, then differentiate the stationarity condition."""
         x, soft_targets = ctx.saved_tensors
+        grad = grad.contiguous()  # as all vectors here are; it enters with any strides
         objective: Objective = ctx.objective
         edges, soft = objective.edges, objective.soft
         R, turned = objective.linearise(x, precise=ctx.options.grad_tol < 1e-4)

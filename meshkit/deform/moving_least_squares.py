@@ -53,7 +53,7 @@ def rigid_moving_least_squares(
         >>> torch.allclose(moved, rest @ turn.mT + 2, atol=1e-4)
         True
     """
-    check_target(rest, target, radius)
+    check_target(rest, target, radius, features)
     with torch.autocast(rest.device.type, enabled=False):
         dtype = torch.promote_types(torch.promote_types(rest.dtype, target.dtype), torch.float32)
         v, t, middle = centred(rest.to(dtype), target.to(dtype), mask)

@@ -11,10 +11,14 @@ __all__: list[str] = []
 _PRIOR = 0.02  # share of the whole shape's rotation in each neighbourhood's covariance
 
 
-def check_target(rest: Tensor, target: Tensor, radius: float) -> None:
+def check_target(rest: Tensor, target: Tensor, radius: float, features: Tensor | None) -> None:
     """Refuse what is no shape with a target."""
     if rest.dim() != 3 or rest.shape != target.shape or rest.shape[2] != 3:
         raise ValueError(f"rest and target must both be (B, N, 3), got {tuple(rest.shape)} and {tuple(target.shape)}")
+    if features is not None and (features.shape[:-1] != rest.shape[:2] or features.shape[-1] == 0):
+        raise ValueError(
+            f"features must be ({rest.shape[0]}, {rest.shape[1]}, D) beside rest, got {tuple(features.shape)}"
+        )
     if not radius > 0:
         raise ValueError(f"radius must be positive, got {radius}")
 

@@ -69,7 +69,7 @@ def poisson_deform(
         >>> torch.allclose(moved, rest @ turn.mT + 2, atol=1e-4)
         True
     """
-    check_target(rest, target, radius)
+    check_target(rest, target, radius, features)
     if not 0 < weight < math.inf:
         raise ValueError(f"weight must be positive and finite, got {weight}")
     with torch.autocast(rest.device.type, enabled=False):

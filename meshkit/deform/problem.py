@@ -14,6 +14,8 @@ __all__ = ["Problem"]
 class Problem:
     """The meshes of a batch; `MeshByMesh` takes them apart, `WholeBatch` keeps them together.
 
+    Tensors may come with any strides; the rows that are made of them here are contiguous, and so is all that follows.
+
     Both have the same methods, ``positions``, ``weights``, ``handles``, ``random_handles``, ``goal``, ``goal_at``,
     ``deform`` and ``energies``, each with handles and positions of its own kind.
 
@@ -51,7 +53,7 @@ class Problem:
         """Positions of the shape of `verts` as (B, V, 3)."""
         if positions.shape != self.shape:
             raise ValueError(f"{name} must have the shape of verts {tuple(self.shape)}, got {tuple(positions.shape)}")
-        return positions.reshape(self.batch, self.size, 3)
+        return positions.contiguous().view(self.batch, self.size, 3)
 
     def weight_rows(self, weights: Tensor, name: str) -> Tensor:
         """Weights (V,) or of one more dimension as (B, V)."""
@@ -59,7 +61,7 @@ class Problem:
         if tuple(weights.shape) not in either:
             wanted = " or ".join(str(shape) for shape in sorted(either, key=len))
             raise ValueError(f"{name} must have shape {wanted}, got {tuple(weights.shape)}")
-        return weights.expand(self.batch, self.size)
+        return weights.expand(self.batch, self.size).contiguous()
 
     def handle_rows(self, handles: Tensor) -> Tensor:
         """Handles as (B, H)."""

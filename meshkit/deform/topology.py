@@ -75,7 +75,7 @@ class ARAPTopology:
         """Return the topology of equal faces from before, if it is among the last `keep` asked for."""
         from hashlib import blake2b
 
-        content = faces.detach().cpu().long().contiguous()
+        content = faces.detach().cpu().long()
         key = (energy, num_verts, blake2b(content.numpy().tobytes(), digest_size=16).digest())
         topology = _CACHED.pop(key, None) or cls(content, num_verts, energy=energy)
         _CACHED[key] = topology

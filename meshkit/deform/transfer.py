@@ -172,4 +172,4 @@ class _Poisson(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return ctx.solve(grad.contiguous()), None
+        return ctx.solve(grad), None

@@ -30,9 +30,9 @@ class WholeBatch(Problem):
         super().__init__(verts, faces, mask)
         self.masked = mask is not None
         everything = torch.ones(self.batch, self.size, dtype=torch.bool, device=self.device)
-        self.mask = everything if mask is None else mask.to(self.device).view(self.batch, -1)
+        self.mask = everything if mask is None else mask.to(self.device).contiguous().view(self.batch, -1)
         faces = faces.detach().to(self.device).long().expand(self.batch, -1, 3)
-        self.verts = verts.view(self.batch, self.size, 3)
+        self.verts = self.rows(verts, "verts")
         self.rest = BatchedRest(self.verts, faces, self.mask, energy)
         used = faces[..., 0].flatten() >= 0
         corners_real = self.mask.flatten()[self.rest.edges.faces].all(-1)

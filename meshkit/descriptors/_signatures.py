@@ -24,7 +24,7 @@ def wave_bands(count: int, width: float) -> Bands:
     def bands(eigenvalues: Tensor) -> tuple[Tensor, Tensor]:
         log_values = eigenvalues.log()
         first, last = float(log_values[0]), 0.98 * float(log_values[-1])
-        energies = torch.linspace(first, last, count, dtype=log_values.dtype)
+        energies = torch.linspace(first, last, count, dtype=log_values.dtype, device=log_values.device)
         spread = width * (energies[1] - energies[0]).abs().clamp_min(1e-9)
         weights = torch.exp(-(energies[:, None] - log_values).square() / (2 * spread**2))
         return weights / weights.sum(1, keepdim=True), torch.zeros_like(energies)
@@ -38,7 +38,7 @@ def heat_bands(count: int) -> Bands:
 
     def bands(eigenvalues: Tensor) -> tuple[Tensor, Tensor]:
         first, last = (math.log(4 * math.log(10) / float(eigenvalues[i])) for i in (-1, 0))
-        times = torch.linspace(first, last, count, dtype=eigenvalues.dtype).exp()
+        times = torch.linspace(first, last, count, dtype=eigenvalues.dtype, device=eigenvalues.device).exp()
         return torch.exp(-times[:, None] * eigenvalues), torch.ones_like(times)
 
     return bands

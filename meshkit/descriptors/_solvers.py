@@ -68,8 +68,8 @@ def block_krylov(matrix: Any, k: int, positions: np.ndarray, scale: np.ndarray) 
 
 
 def _ritz_pairs(solve: Any, k: int, size: int, start: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    basis = torch.empty(size, len(start), dtype=torch.float64).T
-    projected = torch.zeros(size, size, dtype=torch.float64)
+    basis = torch.empty(size, len(start), dtype=torch.float64, device="cpu").T
+    projected = torch.zeros(size, size, dtype=torch.float64, device="cpu")
     basis[:, :_BLOCK] = torch.linalg.qr(torch.from_numpy(start))[0]
     before, low, high = 0, 0, _BLOCK
     while True:
@@ -89,7 +89,7 @@ def _ritz_pairs(solve: Any, k: int, size: int, start: np.ndarray) -> tuple[np.nd
         basis[:, low:high] = following[:, : high - low]
         projected[low:high, before:low] = triangle[: high - low]
     inverted, mixing = torch.linalg.eigh((projected + projected.T) / 2)
-    lowest = torch.arange(size - 1, size - 1 - k, -1)
+    lowest = torch.arange(size - 1, size - 1 - k, -1, device="cpu")
     return (1 / inverted[lowest] - _BLOCK_SHIFT).numpy(), (basis @ mixing[:, lowest]).numpy()
 
 

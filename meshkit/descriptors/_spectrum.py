@@ -69,7 +69,7 @@ def _solve(points: Tensor, faces: Tensor | None, k: int, tol: float, method: str
     return (
         torch.from_numpy(eigenvalues.clip(min=0.0)),
         torch.from_numpy(np.ascontiguousarray(vectors * scale[:, None])),
-        torch.tensor(area, dtype=torch.float64),
+        torch.tensor(area, dtype=torch.float64, device="cpu"),
     )
 
 

@@ -6,6 +6,7 @@ from typing import Any, Literal, Protocol, get_args
 import torch
 from torch import Tensor, nn
 
+from meshkit._numerics import full_precision
 from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.losses._common import Reduction, at_least_float32, check_reduction, reduce_samples
@@ -210,6 +211,7 @@ class _GramResidual(torch.autograd.Function):
         return torch.stack(parts).sum(0)
 
     @staticmethod
+    @full_precision
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         factor, real = ctx.saved_tensors
         gradient = torch.empty_like(factor)

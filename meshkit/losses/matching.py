@@ -6,6 +6,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from meshkit._numerics import safe_log
 from meshkit.losses._common import ReducedLoss, Reduction, at_least_float32, check_reduction, reduce_samples
 
 __all__ = ["MatchingLoss", "RowPlanLike", "matching_loss"]
@@ -71,19 +72,13 @@ def matching_loss(plan: Tensor | RowPlanLike, correspondence: Tensor, *, reducti
     if isinstance(plan, Tensor):
         plan = at_least_float32(plan)
         entries = plan.gather(2, correspondence.clamp_min(0).long()[..., None])[..., 0]
-        masses, at = plan.sum(2), logarithm(entries)
+        masses, at = plan.sum(2), safe_log(entries)
     else:
         masses, at = plan.row_sums(), plan.log_at(correspondence)
     known = known & (masses > 0)  # a row of no weight has no distribution
     at = torch.where(at.isneginf(), math.log(torch.finfo(at.dtype).tiny), at)
     bits = torch.where(known, masses, 1.0).log() - torch.where(known, at, 0.0)
     return reduce_samples(torch.where(known, bits, 0.0).sum(1), known.sum(1), reduction)
-
-
-def logarithm(entries: Tensor) -> Tensor:
-    """Logarithms, -inf with a gradient of zero (not NaN) where there is nothing."""
-    nothing = entries <= 0
-    return torch.where(nothing, 1.0, entries).log().masked_fill(nothing, -torch.inf)
 
 
 class MatchingLoss(ReducedLoss):

@@ -6,7 +6,9 @@ from torch import Tensor, nn
 
 from meshkit._repr import settings
 from meshkit.deform import arap_energy
+from meshkit.deform.topology import check_energy
 from meshkit.ot import sinkhorn_divergence
+from meshkit.ot.divergence import read_divergence_options
 
 __all__ = ["ARAPEnergyLoss", "SinkhornDivergenceLoss"]
 
@@ -37,7 +39,8 @@ class SinkhornDivergenceLoss(nn.Module):
         reduction: ``"mean"`` over samples, or ``"none"``.
 
     Raises:
-        ValueError: if the reduction is unknown, or as :func:`meshkit.ot.sinkhorn_divergence`.
+        ValueError: if the reduction is unknown or an option out of range, and as
+            :func:`meshkit.ot.sinkhorn_divergence`.
 
     Example:
         >>> import torch
@@ -58,6 +61,7 @@ class SinkhornDivergenceLoss(nn.Module):
     ) -> None:
         super().__init__()
         _check_reduction(reduction)
+        read_divergence_options(eps, n_iters, tol, anneal, "auto", "auto")
         self.eps, self.n_iters, self.tol, self.anneal, self.debias = eps, n_iters, tol, anneal, debias
         self.reduction: SampleReduction = reduction
 
@@ -87,11 +91,11 @@ class ARAPEnergyLoss(nn.Module):
     """Module form of :func:`meshkit.deform.arap_energy`: how far a mesh is from a locally rigid copy of another.
 
     Args:
-        energy: ``"spokes_and_rims"`` or ``"spokes"``.
+        energy: ``"spokes_and_rims"``, ``"spokes"``, ``"spokes_unclamped"`` or ``"elements"``.
         reduction: ``"mean"`` over samples of the energies (sums over cells, squared units of length), or ``"none"``.
 
     Raises:
-        ValueError: if the reduction is unknown, or as :func:`meshkit.deform.arap_energy`.
+        ValueError: if the energy or the reduction is unknown, and as :func:`meshkit.deform.arap_energy`.
 
     Example:
         >>> import torch
@@ -103,6 +107,7 @@ class ARAPEnergyLoss(nn.Module):
     def __init__(self, *, energy: str = "spokes_and_rims", reduction: SampleReduction = "mean") -> None:
         super().__init__()
         _check_reduction(reduction)
+        check_energy(energy)
         self.energy = energy
         self.reduction: SampleReduction = reduction
 

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from meshkit._numerics import safe_log
+
 STABILIZER = 1e-8
 
 
@@ -74,8 +76,7 @@ class DensePlan:
     def log_at(self, columns: Tensor) -> Tensor:
         """Logarithm of the entry at one column of each row, ``(B, N)``; -inf at negative columns."""
         masses = self._matrix.gather(2, columns.clamp_min(0)[..., None])[..., 0]
-        none = (columns < 0) | (masses <= 0)  # replaced before the logarithm, whose gradient there is not finite
-        return torch.where(none, 1.0, masses).log().masked_fill(none, -torch.inf)
+        return safe_log(masses.masked_fill(columns < 0, 0.0))
 
     def mutual(self) -> tuple[Tensor, Tensor]:
         """The heaviest column of each row, and whether that column prefers this row too."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, normalize
 
+from meshkit._checks import check_descriptors, check_dtype
 from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.norm import instance_norm
@@ -40,7 +41,9 @@ class PointwiseExtractor(nn.Module):
         ``positions (B, N, 3)``, ``descriptors (B, N, D)`` or ``None``, ``mask (B, N)``; result ``(B, N, widths[-1])``.
 
     Raises:
-        ValueError: meshes are not (B, N, 3), descriptors missing, unexpected or of another shape.
+        ValueError: meshes are not (B, N, 3), descriptors missing, unexpected or of another shape; no channels, or a
+            negative number of blocks.
+        TypeError: descriptors that are no tensor, or ``positions`` and the parameters in two dtypes.
 
     Reference:
         Song et al., "3D Pose Transfer with Correspondence Learning and Mesh Refinement" (3D-CoreNet); sizes, slopes
@@ -55,6 +58,10 @@ class PointwiseExtractor(nn.Module):
         self, widths: Sequence[int] = (64, 128, 256), *, blocks: int = 4, descriptors: int = 0, slope: float = 0.2
     ) -> None:
         super().__init__()
+        if not widths or min(widths) < 1:
+            raise ValueError(f"widths must be at least one positive number of channels, got {tuple(widths)}")
+        if blocks < 0:
+            raise ValueError(f"blocks must not be negative, got {blocks}")
         self.descriptors, self.out_features, self.slope = descriptors, widths[-1], slope
         self.linears = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise([3 + descriptors, *widths]))
         self.blocks = nn.ModuleList(_ResidualBlock(widths[-1]) for _ in range(blocks))
@@ -66,13 +73,9 @@ class PointwiseExtractor(nn.Module):
     def forward(self, positions: Tensor, *, descriptors: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Features of each vertex."""
         check_verts(positions, name="positions")
+        check_dtype(positions, self, name="positions")
         check_mask(mask, *positions.shape[:2])
-        given = 0 if descriptors is None else descriptors.shape[-1]
-        if given != self.descriptors:
-            raise ValueError(
-                f"this extractor takes {self.descriptors} descriptor channels, got {given}"
-                + ("" if given else ": compute them with meshkit.descriptors.intrinsic_descriptors")
-            )
+        check_descriptors(descriptors, positions, self.descriptors)
         x = positions if descriptors is None else torch.cat([positions, descriptors.to(positions.dtype)], 2)
         if mask is not None:
             x = x.masked_fill(~mask[..., None], 0.0)

@@ -89,13 +89,13 @@ def mirror_labels(
     rest = (verts[i] - verts[j]).norm(dim=1)
     if len(i) == 0 or not float(rest.mean()) > 0:
         return torch.zeros(num, dtype=torch.bool, device=device)
-    positions, length, every = (targets, mirrored), rest.mean(), torch.arange(num)
+    positions, length, every = (targets, mirrored), rest.mean(), torch.arange(num, device="cpu")
     tails, heads = torch.cat([i, every]), torch.cat([j, partner])
-    costs = torch.empty(2, 2, len(tails), dtype=torch.float64)  # of the two labels of each pair
+    costs = torch.empty(2, 2, len(tails), dtype=torch.float64, device="cpu")  # of the two labels of each pair
     for a in (0, 1):
         for b in (0, 1):
             stretch = ((positions[a][i] - positions[b][j]).norm(dim=1) - slack * rest).clamp_min(0) / length
-            costs[a, b] = torch.cat([stretch, torch.full((num,), tie * float(a != b), dtype=torch.float64)])
+            costs[a, b] = torch.cat([stretch, stretch.new_full((num,), tie * float(a != b))])
     labels = least_labels(tails, heads, costs, num)
     none = torch.zeros_like(labels)
     volume, opposite, before, swapped = (
@@ -118,12 +118,12 @@ def least_labels(tails: Tensor, heads: Tensor, costs: Tensor, num: int) -> Tenso
     wish = costs[0, 0] + costs[1, 1] - costs[0, 1] - costs[1, 0]  # positive: to differ
     start = spanning_labels(tails, heads, wish, num)
     first, second = start[tails].long(), start[heads].long()
-    edge = torch.arange(len(tails))
+    edge = torch.arange(len(tails), device="cpu")
     (same_0, other), (swapped, same_1) = ([costs[first ^ a, second ^ b, edge] for b in (0, 1)] for a in (0, 1))
     surplus = (same_0 + same_1 - other - swapped).clamp_min(0) / 2
     other, swapped = other + surplus, swapped + surplus
     # same_0 + (swapped - same_0) y_i + (same_1 - swapped) y_j + (other + swapped - same_0 - same_1) (1 - y_i) y_j
-    linear = torch.zeros(num, dtype=costs.dtype).index_add_(0, tails, swapped - same_0)
+    linear = costs.new_zeros(num).index_add_(0, tails, swapped - same_0)
     linear.index_add_(0, heads, same_1 - swapped)
     return start ^ minimum_cut(tails, heads, (other + swapped - same_0 - same_1).clamp_min(0), linear)
 
@@ -136,7 +136,7 @@ def spanning_labels(tails: Tensor, heads: Tensor, wish: Tensor, num: int) -> Ten
     proper = tails != heads
     low, high = torch.minimum(tails, heads)[proper], torch.maximum(tails, heads)[proper]
     pairs, inverse = torch.unique(low * num + high, return_inverse=True)
-    total = torch.zeros(len(pairs), dtype=wish.dtype).index_add_(0, inverse, wish[proper])
+    total = wish.new_zeros(len(pairs)).index_add_(0, inverse, wish[proper])
     strength = total.abs()
     length = strength.amax() + 1 - strength if len(total) else strength  # positive, the least for the strongest
     places = (pairs // num).numpy(), (pairs % num).numpy()
@@ -149,7 +149,7 @@ def spanning_labels(tails: Tensor, heads: Tensor, wish: Tensor, num: int) -> Ten
         for vertex in order[1:].tolist():
             parent = int(before[vertex])
             labels[vertex] = labels[parent] ^ differ[min(parent, vertex) * num + max(parent, vertex)]
-    return torch.tensor(labels)
+    return torch.tensor(labels, device="cpu")
 
 
 def minimum_cut(tails: Tensor, heads: Tensor, capacities: Tensor, cost_of_1: Tensor) -> Tensor:
@@ -159,10 +159,10 @@ def minimum_cut(tails: Tensor, heads: Tensor, capacities: Tensor, cost_of_1: Ten
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
     num = len(cost_of_1)
-    source, sink, every = num, num + 1, torch.arange(num)
+    source, sink, every = num, num + 1, torch.arange(num, device="cpu")
     # On the sink's side lies label 1: its cost is paid on the edge from the source, that of 0 on the edge to the sink.
-    rows = torch.cat([tails, torch.full((num,), source), every])
-    columns = torch.cat([heads, every, torch.full((num,), sink)])
+    rows = torch.cat([tails, tails.new_full((num,), source), every])
+    columns = torch.cat([heads, every, heads.new_full((num,), sink)])
     weights = torch.cat([capacities, cost_of_1.clamp_min(0), (-cost_of_1).clamp_min(0)])
     whole = (_UNITS * weights).round().clamp_max(_LARGEST // 8)
     graph = coo_array((whole.numpy(), (rows.numpy(), columns.numpy())), shape=(num + 2, num + 2)).tocsr()
@@ -171,7 +171,7 @@ def minimum_cut(tails: Tensor, heads: Tensor, capacities: Tensor, cost_of_1: Ten
     residual = graph - maximum_flow(graph, source, sink).flow
     residual.data = np.maximum(residual.data, 0)
     residual.eliminate_zeros()
-    labels = torch.ones(num + 2, dtype=torch.bool)
+    labels = torch.ones(num + 2, dtype=torch.bool, device="cpu")
     labels[torch.from_numpy(breadth_first_order(residual, source, return_predecessors=False).astype(np.int64))] = False
     return labels[:num]
 

@@ -51,7 +51,7 @@ def edge_mlp(
         shift2: see ``w2``.
         w3: see ``w2``.
         neighbors: ``(B, N, k)`` int64.
-        mask: ``(B, N)`` or None. The maximum is 0 at padded vertices.
+        mask: ``(B, N)`` or None. The maximum is 0 at padded vertices, and so is all of a sample without real ones.
         slope: of the LeakyReLU.
         recompute: hold no tensor of R rows at any time; else z_2 is kept for the backward.
         dtype: of the R rows.
@@ -65,7 +65,7 @@ def edge_mlp(
 def _run_forward(*inputs: Any) -> tuple[Tensor, ...]:
     u, v, w2, scale2, shift2, w3, neighbors, mask, slope, recompute, keep, dtype = inputs
     batch, num, channels = u.shape
-    best, state = torch.zeros_like(u), u.new_empty(batch, 4, channels)
+    best, state = torch.zeros_like(u), u.new_zeros(batch, 4, channels)
     groups = list(_groups(neighbors, mask, channels))
     room = batch if keep else 0 if recompute else max((len(state[b]) for b, _, _ in groups), default=0)
     kept = u.new_empty(room, num * neighbors.shape[2], channels, dtype=dtype)
@@ -173,7 +173,8 @@ def _groups(neighbors: Tensor, mask: Tensor | None, channels: int) -> Iterator[t
             yield one, slice(None), neighbors[one]
         else:
             real = mask[b].nonzero()[:, 0]
-            yield one, real, (mask[b].cumsum(0) - 1)[neighbors[b, real]][None]
+            if len(real):  # no rows have no mean
+                yield one, real, (mask[b].cumsum(0) - 1)[neighbors[b, real]][None]
 
 
 class _Rows:

@@ -9,7 +9,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from meshkit._checks import check_channels, check_dtype, check_features
+from meshkit._checks import check_channels, check_descriptors, check_dtype, check_features
 from meshkit._repr import settings
 from meshkit.batching import check_mask
 from meshkit.neighbors import gather_vertices, knn
@@ -44,7 +44,8 @@ class SetConv(nn.Module):
             products; else one tensor ``(B, N k, out_features)`` is kept for the backward.
 
     Shape:
-        ``x (B, N, C)``, ``positions (B, N, 3)``, ``neighbors (B, N, k)`` int64; the result is ``(B, N, out_features)``.
+        ``x (B, N, C)``, ``positions (B, N, 3)``, ``neighbors (B, N, k)`` int64; the result is ``(B, N, out_features)``,
+        0 at padded vertices.
 
     Raises:
         ValueError: negative slope, no channels, or shapes that do not fit.
@@ -177,7 +178,7 @@ def _neighborhoods(positions: Tensor, neighbors: Tensor, mask: Tensor | None) ->
     else:
         real = mask[..., None].to(positions)
         positions = positions.masked_fill(~mask[..., None], 0.0)
-    count = real.sum(1, keepdim=True)
+    count = real.sum(1, keepdim=True).clamp_min(1)
     positions = (positions - positions.sum(1, keepdim=True) / count) * real
     rows = k * count
     relative = (gather_vertices(positions, neighbors) - positions[:, :, None]) * real[..., None]
@@ -246,19 +247,7 @@ class SetConvExtractor(nn.Module):
             raise ValueError(f"positions must have shape (B, N, 3), got {tuple(positions.shape)}; {hint}")
         check_dtype(positions, self, name="positions")
         check_mask(mask, *positions.shape[:2])
-        if descriptors is not None:
-            check_features(descriptors, name="descriptors", layout="(B, N, D)")
-            if descriptors.shape[:2] != positions.shape[:2]:
-                raise ValueError(
-                    f"descriptors (B, N, D) and positions (B, N, 3) must agree in B and N, got "
-                    f"{tuple(descriptors.shape)} and {tuple(positions.shape)}"
-                )
-        given = 0 if descriptors is None else descriptors.shape[-1]
-        if given != self.descriptors:
-            raise ValueError(
-                f"this extractor takes {self.descriptors} descriptor channels, got {given}"
-                + ("" if given else ": compute them with meshkit.descriptors.intrinsic_descriptors")
-            )
+        check_descriptors(descriptors, positions, self.descriptors)
         if mask is not None:
             positions = positions.masked_fill(~mask[..., None], 0.0)
         neighbors = knn(positions.detach(), self.k, mask=mask)

@@ -21,7 +21,7 @@ def logit_features(
     The cost is ``shift`` minus eps times the logit. A shift changes nothing in balanced transport; with ``constant`` it
     is 0, for unbalanced transport.
     """
-    rate, value = LOG2_E / eps, float(eps.detach() if isinstance(eps, Tensor) else eps)
+    rate, value = logits_per_cost(eps, x.dtype), number(eps)
     if cost == "dot":
         bound = 2 * float(norms(x).amax() * norms(y).amax()) if len(x) else 0.0
         return x * rate, y.clone(), bound / value, 0.0  # of its own: the caller may change y in place later
@@ -41,6 +41,16 @@ def logit_features(
     squared_x, squared_y = x.square().sum(1, keepdim=True), y.square().sum(1, keepdim=True)
     x = torch.cat([2 * x, -squared_x, -torch.ones_like(squared_x)], 1) * rate
     return x, torch.cat([y, torch.ones_like(squared_y), squared_y], 1), spread, 0.0
+
+
+def number(eps: float | Tensor) -> float:
+    """Its value, a constant."""
+    return float(eps.detach() if isinstance(eps, Tensor) else eps)
+
+
+def logits_per_cost(eps: float | Tensor, dtype: torch.dtype) -> float | Tensor:
+    """The factor from costs to base-2 logits, in the precision of these, whatever that of eps."""
+    return LOG2_E / (eps.to(dtype) if isinstance(eps, Tensor) else eps)
 
 
 def norms(x: Tensor) -> Tensor:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from meshkit._compile import uncompiled
 from meshkit.batching import check_mask
-from meshkit.ot.costs import logit_features
-from meshkit.ot.options import Cost, Domain, Store, check_choice, plain, read_options
+from meshkit.ot.costs import logit_features, number
+from meshkit.ot.options import Cost, Domain, Options, Store, check_choice, plain, read_options
 from meshkit.ot.sample import SamplePlan
 from meshkit.ot.sinkhorn import check_features, eps_schedule, solve_features
 
@@ -83,7 +83,7 @@ def sinkhorn_divergence(
         one side, not finite for one with a real point that is not.
 
     Raises:
-        ValueError: as :func:`~meshkit.ot.sinkhorn`.
+        ValueError: as :func:`~meshkit.ot.sinkhorn`, and if ``anneal`` is not between 0 and 1.
 
     Reference:
         Feydy et al. 2019, "Interpolating between optimal transport and MMD using Sinkhorn divergences".
@@ -97,12 +97,8 @@ def sinkhorn_divergence(
         >>> round(shifted.item(), 3)
         9.0
     """
-
-    eps, n_iters = plain(eps), plain(n_iters)
-    if not isinstance(eps, int | float):
-        raise ValueError(f"eps must be a number, got {type(eps).__name__}; use anneal to lower it in steps")
-
-    options = read_options(eps, n_iters, tol, None, "unroll", domain, store)
+    options = read_divergence_options(eps, n_iters, tol, anneal, domain, store)
+    eps, n_iters = number(options.eps), options.settings.n_iters
 
     def transport(first: Side, second: Side, dual: Literal["between", "within"]) -> Tensor:
         own = options._replace(dual=dual)
@@ -127,6 +123,18 @@ def sinkhorn_divergence(
     if debias:
         value = value - (transport(mu, mu, "within") + transport(nu, nu, "within")) / 2
     return torch.where(mu.alive() & nu.alive(), value, 0.0)
+
+
+def read_divergence_options(
+    eps: float, n_iters: int, tol: float | None, anneal: float | None, domain: Domain, store: Store
+) -> Options:
+    """Check the options that do not depend on the points."""
+    eps = plain(eps)
+    if not isinstance(eps, int | float):
+        raise ValueError(f"eps must be a number, got {type(eps).__name__}; use anneal to lower it in steps")
+    if anneal is not None and not 0 < anneal < 1:
+        raise ValueError(f"anneal must be between 0 and 1, or None to start at eps, got {anneal}")
+    return read_options(eps, n_iters, tol, None, "unroll", domain, store)
 
 
 class Side(NamedTuple):

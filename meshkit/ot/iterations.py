@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from meshkit.ot.kernel import GibbsKernel, Ledger, full_precision, refuse_second_derivative
+from meshkit._numerics import full_precision
+from meshkit.ot.kernel import GibbsKernel, Ledger, refuse_second_derivative
 from meshkit.ot.tiles import Factors, Reference, Tiles
 
 __all__: list[str] = []  # internal: meshkit.ot lists what is public

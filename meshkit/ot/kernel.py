@@ -7,13 +7,12 @@ kernel, after all of them, one sweep contracts their sum with the features.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from meshkit._numerics import full_precision
 from meshkit.ot.tiles import Factors, Reference, Tiles
 
 __all__: list[str] = []  # internal: meshkit.ot lists what is public
@@ -22,17 +21,6 @@ NO_SECOND_DERIVATIVE = (
     "sinkhorn has no second derivatives: its gradient is computed without a graph of its own. Leave out create_graph, "
     "or differentiate a dense plan written with torch operations"
 )
-
-
-def full_precision(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Run a pass of an autograd function outside autocast: in bfloat16 marginals would be off by half a per cent."""
-
-    @wraps(method)
-    def run(ctx: Any, first: Tensor, *rest: Any) -> Any:
-        with torch.autocast(first.device.type, enabled=False):
-            return method(ctx, first, *rest)
-
-    return run
 
 
 class Ledger:

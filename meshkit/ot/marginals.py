@@ -101,7 +101,7 @@ def check_totals(mu: Tensor | None, nu: Tensor | None) -> None:
     """Balanced transport moves as much mass as there is room for; a side without any mass is let pass."""
     if mu is None and nu is None:
         return
-    totals = [torch.ones(1) if w is None else w.detach().sum(1).cpu() for w in (mu, nu)]
+    totals = [torch.ones(1, device="cpu") if w is None else w.detach().sum(1).cpu() for w in (mu, nu)]
     differ = (totals[0] - totals[1]).abs() > 1e-3 * totals[0].maximum(totals[1])
     if bool((differ & (totals[0] > 0) & (totals[1] > 0)).any()):
         raise ValueError(

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
+from meshkit.ot.costs import number
 from meshkit.ot.iterations import Settings
 from meshkit.ot.marginals import Sides
 
@@ -89,7 +90,7 @@ def read_options(
         schedule, eps = eps, final
     if isinstance(eps, Tensor) and eps.numel() != 1:
         raise ValueError(f"eps as a tensor must hold one value, got shape {tuple(eps.shape)}")
-    value = float(eps.detach() if isinstance(eps, Tensor) else eps)
+    value = number(eps)
     if not 0 < value < math.inf:
         raise ValueError(f"eps must be positive and finite, got {value:g}")
     powers = []

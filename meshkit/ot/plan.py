@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from meshkit._compile import uncompiled
+from meshkit.ot.costs import number
 from meshkit.ot.sample import SamplePlan, pad_columns, spread
 from meshkit.ot.stacked import split
 
@@ -58,7 +59,7 @@ class TransportPlan:
 
     def __repr__(self) -> str:
         """Shape, type and regularisation."""
-        eps = float(torch.as_tensor(self._any.eps).detach())
+        eps = number(self._any.eps)
         return f"TransportPlan(shape={tuple(self.shape)}, dtype={self.dtype}, eps={eps:g}, n_iters={self.n_iters})"
 
     @property
@@ -208,24 +209,23 @@ class TransportPlan:
             >>> plan.log_at(torch.tensor([[1, 2, -1]])).exp()  # a third each, the mass of a row
             tensor([[0.3333, 0.3333, 0.0000]])
         """
-        batch, rows, number = self.shape
+        batch, rows, size = self.shape
         if columns.shape != (batch, rows) or columns.dtype not in (torch.int64, torch.int32):
             raise ValueError(
                 f"columns must be integers of shape (B, N) = {(batch, rows)}, got {columns.dtype} of "
                 f"{tuple(columns.shape)}"
             )
-        columns = torch.where(columns < 0, number, columns).long()
         found = []
         with torch.autocast(self.device.type, enabled=False):
-            for sample, wanted in zip(self._samples, columns, strict=True):
+            for sample, wanted in zip(self._samples, columns.long(), strict=True):
                 own, other = (sample.index_x, sample.index_y)[:: -1 if self._transposed else 1]
                 near = wanted if own is None else wanted[own]
                 if other is not None:  # from the padded batch's columns to those that have weight
-                    local = torch.full((number + 1,), -1, device=self.device)
+                    local = torch.full((size,), -1, device=self.device)
                     local[other] = torch.arange(len(other), device=self.device)
-                    near = local[near]
-                none = (near < 0) | (near == number)
-                values = sample.log_masses(near.masked_fill(none, 0)[:, None], not self._transposed)[:, 0]
+                    near = torch.where(near < 0, near, local[near.clamp_min(0)])
+                none = near < 0
+                values = sample.log_masses(near.clamp_min(0)[:, None], not self._transposed)[:, 0]
                 found.append(values.masked_fill(none, -torch.inf))
         return self._spread(found, over_rows=not self._transposed, empty=-torch.inf)
 
@@ -269,7 +269,7 @@ class TransportPlan:
                 scores = sample.log_dense().double().nan_to_num(neginf=-1e300).cpu()
             scores = scores.mT if self._transposed else scores
             row, column = linear_sum_assignment(scores.numpy(), maximize=True)
-            matched = torch.full((len(scores),), -1)
+            matched = torch.full((len(scores),), -1, device="cpu")
             matched[torch.from_numpy(row)] = torch.from_numpy(column)
             positions = sample.index_x if self._transposed else sample.index_y
             if positions is not None:

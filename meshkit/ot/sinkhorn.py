@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from meshkit._compile import uncompiled
-from meshkit.ot.costs import logit_features
+from meshkit.ot.costs import logit_features, logits_per_cost
 from meshkit.ot.dual import iterate_between, iterate_within
 from meshkit.ot.iterations import iterate_kernel, iterate_log
 from meshkit.ot.kernel import GibbsKernel
@@ -134,7 +134,7 @@ def solve_features(
     shape = len(fx), fx.shape[1], fy.shape[1]
     dtype = torch.promote_types(torch.promote_types(fx.dtype, fy.dtype), torch.float32)
     with torch.autocast(fx.device.type, enabled=False):
-        if not check_finite and stackable(fx, fy, cost, options, a, b, mask_x, mask_y):
+        if not check_finite and stackable(fx, fy, cost, options, dtype, a, b, mask_x, mask_y):
             return TransportPlan(solve_stacked(fx.to(dtype), fy.to(dtype), options), shape)
         like = fx.new_empty(0, dtype=dtype)
         keep = options.keep(math.prod(shape) * dtype.itemsize)
@@ -226,7 +226,7 @@ def solve_cost(
             if options.settings.grad == "none":
                 matrix, sides = matrix.detach(), sides.detached()
             shift = float(matrix.detach().amin()) if matrix.numel() and not options.unbalanced else 0.0
-            logits = (shift - matrix) * (LOG2_E / options.eps)
+            logits = (shift - matrix) * logits_per_cost(options.eps, dtype)
             spread = float(logits.detach().abs().amax()) / LOG2_E if logits.numel() else 0.0
             chosen = "log" if start is not None else options.domain_for(spread, sides)
             first = None if start is None else LOG2_E * sides.rows_of(start[s].to(dtype))

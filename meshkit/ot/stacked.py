@@ -15,9 +15,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from meshkit._numerics import launch_bound
-from meshkit.ot.costs import logit_features
-from meshkit.ot.kernel import GibbsKernel, Ledger, full_precision, refuse_second_derivative
+from meshkit._numerics import full_precision, launch_bound
+from meshkit.ot.costs import logit_features, number
+from meshkit.ot.kernel import GibbsKernel, Ledger, refuse_second_derivative
 from meshkit.ot.options import Options
 from meshkit.ot.sample import SamplePlan
 from meshkit.ot.tiles import LOG2_E, Factors, FeatureTiles, Reference, Tiles
@@ -31,8 +31,10 @@ STACK_BYTES = 1 << 27
 """Kernels up to this size, all samples together, are stored by ``store="auto"``."""
 
 
-def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, *given: Tensor | None) -> bool:
+def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, dtype: torch.dtype, *given: Tensor | None) -> bool:
     """Whether :func:`solve_stacked` may take the problem; ``given`` are masks and weights, which must be missing.
+
+    It would work in ``dtype``.
 
     Only the cosine cost has a range that is known without a look at the features.
     """
@@ -49,13 +51,13 @@ def stackable(fx: Tensor, fy: Tensor, cost: str, options: Options, *given: Tenso
         or settings.grad not in ("unroll", "none")
     ):
         return False
-    (batch, rows, _), columns, dtype = fx.shape, fy.shape[1], torch.promote_types(fx.dtype, torch.float32)
+    (batch, rows, _), columns = fx.shape, fy.shape[1]
     if options.domain == "log" or store == "stream":
         return False
     if store == "auto" and batch * rows * columns * dtype.itemsize > STACK_BYTES:
         return False
-    eps = float(options.eps.detach() if isinstance(options.eps, Tensor) else options.eps)
-    return options.domain == "kernel" or 2 / eps <= math.log(torch.finfo(dtype).max) - math.log(rows * columns)
+    room = math.log(torch.finfo(dtype).max) - math.log(rows * columns)
+    return options.domain == "kernel" or 2 / number(options.eps) <= room
 
 
 def solve_stacked(x: Tensor, y: Tensor, options: Options) -> SamplePlan:

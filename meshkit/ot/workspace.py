@@ -39,7 +39,7 @@ def borrow(owner: Any, rows: int, columns: int, like: Tensor) -> Tensor:
     if buffer is None:
         # Memory first touched in inference mode could not be written to outside of it.
         with torch.inference_mode(False):
-            buffer = torch.empty(numel, dtype=like.dtype)
+            buffer = torch.empty(numel, dtype=like.dtype, device="cpu")
     weakref.finalize(owner, _give_back, buffer).atexit = False
     return buffer[:numel].view(rows, columns)
 
