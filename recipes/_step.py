@@ -14,6 +14,7 @@ import torch
 from _graph import GraphedStep
 from _run import UserError
 from _settings import Settings
+from _threads import Threads
 from torch import Tensor, nn
 
 from meshkit.data import PairBatch
@@ -59,6 +60,7 @@ class Trainer:
         self.fabric, self.system, self.optimizer = fabric, system, optimizer
         self.cfg, self.step, self.steps = cfg, step, steps
         self.graphed: GraphedStep | None = None
+        self.threads = Threads(told=cfg.threads > 0)
 
     def update(self, batch: PairBatch, s: int) -> dict[str, float]:
         """One update; everything random in it follows from the seed, the step and the number of the process.
@@ -78,6 +80,7 @@ class Trainer:
         if not math.isfinite(sum(values) + size):
             raise Diverged(f"the loss is {sum(values)}, its gradient {size} {where(batch, s)}")
         self.optimizer.step()
+        self.threads.look()
         if self.fabric.world_size > 1:
             values = cast(Tensor, self.fabric.all_reduce(torch.tensor(values, device=self.fabric.device))).tolist()
         return dict(zip(losses, values, strict=True)) | {"loss": sum(values)}

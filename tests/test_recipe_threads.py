@@ -1,0 +1,78 @@
+"""A run takes no more threads than it gets cores for."""
+
+import os
+import subprocess
+import sys
+from types import ModuleType
+
+import pytest
+import torch
+from recipe_runs import ROOT, recipe_module
+
+pytest.importorskip("tqdm")
+
+SPIN = """
+import os, sys, threading, time
+sys.path.insert(0, "recipes")
+import torch, _threads
+torch.set_num_threads(1)
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+block = torch.rand(400, 400)
+threads = [threading.Thread(target=lambda: [block @ block for _ in range(60)]) for _ in range(2)]
+start, before = time.perf_counter(), _threads.waited()
+for thread in threads: thread.start()
+time.sleep(0.2)
+print((_threads.waited() - before) / (time.perf_counter() - start))
+for thread in threads: thread.join()
+"""
+
+
+@pytest.fixture
+def module() -> ModuleType:
+    return recipe_module("_threads")
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
+def test_time_that_threads_wait_for_a_core_is_counted(module: ModuleType) -> None:
+    """Threads of one process on one core wait for each other all the time that one runs."""
+    if not list(module.TASKS.glob("*/schedstat")):
+        pytest.skip("this system does not count how long threads wait")
+    done = subprocess.run([sys.executable, "-c", SPIN], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert float(done.stdout) > 0.4
+
+
+@pytest.mark.parametrize(
+    ("told", "waiting", "left"),
+    [
+        (False, [0.1], 4),
+        (False, [1.1], 3),
+        (False, [1.6], 2),
+        (False, [9.0], 1),
+        (False, [1.0, 1.0, 0.2], 2),
+        (True, [3.0], 4),
+    ],
+)
+def test_threads_without_cores_are_taken_away(
+    module: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    told: bool,
+    waiting: list[float],
+    left: int,
+) -> None:
+    """Of four, by the share of time that they waited in a window; what waits a quarter of the time is let pass."""
+    clock, total, number = [0.0], [0.0], [4]
+    monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(module, "waited", lambda: total[0])
+    monkeypatch.setattr(torch, "get_num_threads", lambda: number[0])
+    monkeypatch.setattr(torch, "set_num_threads", lambda new: number.__setitem__(0, new))
+    threads = module.Threads(told=told, window=5.0)
+    for share in waiting:
+        for _ in range(3):  # steps of two seconds: the third is looked back from
+            clock[0] += 2
+            total[0] += 2 * share
+            threads.look()
+    assert number[0] == left
+    said = capsys.readouterr().err
+    assert ("going on with" in said) == (left < 4)
+    assert f"going on with {left} of" in said or left == 4
