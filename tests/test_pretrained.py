@@ -255,7 +255,9 @@ def test_a_run_of_no_known_recipe_is_refused(exporter, finished_run, tmp_path, m
 def test_the_cards_that_ship_are_as_the_exporter_writes_them(exporter):
     from weights_page import markdown
 
-    assert set(pretrained_names()) == {"corenet3d-humans", "xdualnet-animals", "xdualnet-humans"}
+    assert set(pretrained_names()) == {
+        f"{s}-{kind}" for s in ("corenet3d", "xdualnet") for kind in ("animals", "humans")
+    }
     for name in pretrained_names():
         card = json.loads((ROOT / "meshkit" / "weights" / f"{name}.json").read_text())
         text = (ROOT / "meshkit" / "weights" / f"{name}.md").read_text()
@@ -293,7 +295,7 @@ def test_a_mistyped_name_finds_the_one_that_was_meant():
         ("XDualNet_Humans", "xdualnet-humans"),
         ("xdualnet-animal", "xdualnet-animals"),
     ):
-        with pytest.raises(ValueError, match=rf"named '{wrong}': did you mean {name}\? There are corenet3d-humans, "):
+        with pytest.raises(ValueError, match=rf"named '{wrong}': did you mean {name}\? There are corenet3d-animals, "):
             load_pretrained(wrong)
 
 

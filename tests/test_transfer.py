@@ -1447,11 +1447,11 @@ def test_weights_of_another_dtype(dtype, person, mover):
     assert_near(result.verts, expected.verts, 0.005 if dtype == torch.float64 else 0.1)
 
 
-@pytest.mark.skipif("xdualnet-animals" not in pretrained_names(), reason="this checkout lacks the weights")
-def test_an_animal_in_meshkits_own_frame_is_not_in_doubt():
+@pytest.mark.parametrize("name", ["corenet3d-animals", "xdualnet-animals"])
+def test_an_animal_in_meshkits_own_frame_is_not_in_doubt(name):
     body = load_shipped("animals")[0]
     verts = body(torch.tensor([0]), torch.tensor([0]))[0]
-    identity = PoseTransfer((verts, body.faces), weights="xdualnet-animals").identity
+    identity = PoseTransfer((verts, body.faces), weights=name).identity
     assert torch.equal(identity.rotation, torch.eye(3)) and identity.doubts == ()
 
 
