@@ -18,12 +18,12 @@ UNITS = {
 MOVED = {"humans": "largest_distance_m", "animals": "largest_distance_units"}  # only humans are in metres
 LIMITS = {
     "humans": (
-        "Bodies and poses unlike the training set; several people in one mesh; clothes and hair that are not one surface "
-        "with\nthe body;"
+        "Bodies and poses unlike the training set; several people in one mesh; clothes and hair that are not one "
+        "surface with\nthe body;"
     ),
     "animals": (
-        "Animals and poses unlike the training set, whose families the test set has not; tails as long or thick as legs, "
-        "which\nare taken for legs;"
+        "Animals and poses unlike the training set, whose families the test set has not; tails as long or thick as "
+        "legs, which\nare taken for legs;"
     ),
 }
 GIVEN = {  # the meshes that the usual numbers are measured on
