@@ -1,6 +1,6 @@
 """Measure how often `meshkit.transfer` finds the axes of shipped bodies, and how often it doubts right and wrong ones.
 
-    OMP_NUM_THREADS=1 python tools/measure_axes.py xdualnet-animals corenet3d-humans
+    OMP_NUM_THREADS=1 python tools/measure_axes.py corenet3d-animals xdualnet-animals corenet3d-humans
 
 Animals: every one in two poses, as it is shipped and with each face cut into four; 40 people, at several vertex counts.
 Each mesh counts in all 24 orientations along the axes: turning it permutes the scores of the candidates. The limits

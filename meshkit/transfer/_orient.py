@@ -17,10 +17,10 @@ from meshkit.transfer.confidence import row_entropies
 
 __all__ = ["RestBody", "agreements", "agrees", "choose", "find_rotation"]
 
-DOUBT = {"humans": 0.05, "animals": 0.08}
+DOUBT = {"humans": 0.05, "animals": 0.1}
 """Lead in score below which an orientation that was found is in doubt, for each kind of body."""
 
-AGREEMENT = {"humans": 0.4, "animals": 0.25}
+AGREEMENT = {"humans": 0.4, "animals": 0.35}
 """Correlation of normals below which an orientation that was given is in doubt, for each kind of body."""
 
 _CLEAR = 0.05  # score by which another orientation must beat the usual ones
