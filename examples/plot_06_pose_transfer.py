@@ -144,9 +144,9 @@ show(contact_sheet(rows[1:], column_titles=titles, captions=captions[1:], colorb
 # Animals
 # -------
 # The weights for animals are poor: 29 animals to train on, other families to test. Copying the identity scores 20.4 on
-# the 400 test pairs, ``corenet3d-animals``, which was told the true matches, 8.6, ``xdualnet-animals``, which saw meshes
-# alone, 9.2. A test animal in a test pose. Its axes are given: to find them would take most of the time, and here gives
-# the same result.
+# the 400 test pairs; ``corenet3d-animals``, which was told the true matches, 8.6; ``xdualnet-animals``, which saw
+# meshes alone, 9.2. A test animal in a test pose. Its axes are given: to find them would take most of the time, and
+# here gives the same result.
 
 animals = load_animals()
 row = animal_split().test_pairs[3][:, None]
