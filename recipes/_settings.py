@@ -62,7 +62,7 @@ class Settings:
     """Further training identities, drawn from the Gaussian of the known ones; shipped and licensed rigs alone. Paper:
     SMAL's animals are drawn so."""
     bone_spread: float = 0.0
-    """Standard deviation of the logarithm by which limbs of the sampled identities are stretched. Paper: 0."""
+    """Standard deviation of the logarithm by which each limb of the sampled identities is stretched. Paper: 0."""
     sampled_poses: int = 0
     """Further training poses: the trunk of one of the known ones, each limb of another; rigs alone. Paper: none."""
     pool: int = 1200
