@@ -14,19 +14,19 @@ TASKS = Path("/proc/self/task")
 
 
 class Threads:
-    """Takes away threads that must wait for a core, in a run that was not told how many to take.
+    """Takes away threads that must wait for a core.
 
     PyTorch's threads wait for one another at the end of each operation, and spin meanwhile. Where another program has a
     core, one spins for another that is not running: two threads on two cores, one of them taken, were over 50 times
     slower than one thread. Looks at :func:`waited`; nothing is taken away where the system does not count it.
 
     Args:
-        told: the number was asked for, and stays.
+        stay: take none away: the number was asked for, or the steps are not computed by these threads.
         window: seconds to look back on, and a step at the least.
     """
 
-    def __init__(self, *, told: bool, window: float = 5.0) -> None:
-        self.number = 1 if told else torch.get_num_threads()
+    def __init__(self, *, stay: bool, window: float = 5.0) -> None:
+        self.all = self.number = 1 if stay else torch.get_num_threads()
         self.window, self.began, self.before = window, time.perf_counter(), waited()
 
     def look(self) -> None:
@@ -40,10 +40,10 @@ class Threads:
         if missing > 0:
             had, self.number = self.number, max(1, self.number - missing)
             torch.set_num_threads(self.number)
-            said = (
-                f"other programs take cores: going on with {self.number} of {had} threads (--threads {had} keeps all)"
+            keep = f"--threads {self.all} keeps all"
+            tqdm.write(
+                f"other programs take cores: going on with {self.number} of {had} threads ({keep})", file=sys.stderr
             )
-            tqdm.write(said, file=sys.stderr)
 
 
 def waited() -> float:
