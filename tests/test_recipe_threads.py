@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from types import ModuleType, SimpleNamespace
 
@@ -79,6 +80,52 @@ def test_threads_without_cores_are_taken_away(
     assert ("going on with" in said) == (left < 4)
     assert f"going on with {left} of" in said or left == 4
     assert said.count("--threads 4 keeps all") == said.count("going on with")
+
+
+def test_threads_come_back_when_cores_are_idle(
+    module: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As many as cores are idle, half a minute after they were taken away, and later each time."""
+    clock, total, free, number = [0.0], [0.0], [0.0], [4]
+    monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(module, "waited", lambda: total[0])
+    monkeypatch.setattr(module, "idle", lambda: free[0])
+    monkeypatch.setattr(torch, "get_num_threads", lambda: number[0])
+    monkeypatch.setattr(torch, "set_num_threads", lambda new: number.__setitem__(0, new))
+    threads = module.Threads(stay=False, window=5.0, patience=30.0)
+
+    def after(seconds: int, *, missing: float = 0.0, idle: float = 0.0) -> int:
+        for _ in range(seconds):
+            clock[0], total[0], free[0] = clock[0] + 1, total[0] + missing, free[0] + idle
+            threads.look()
+        return number[0]
+
+    assert after(40, idle=2.0) == 4 and capsys.readouterr().err == ""  # none to give back
+    assert after(5, missing=3.0) == 1
+    assert after(40, idle=0.6) == 1
+    assert after(5, idle=1.9) == 3
+    assert "cores are idle again: going on with 3 of 4 threads" in capsys.readouterr().err
+    assert after(55, idle=3.0) == 3
+    assert after(5, idle=3.0) == 4
+    assert after(5, missing=1.0, idle=3.0) == 3
+    assert after(115, idle=3.0) == 3
+    assert after(5, idle=3.0) == 4
+
+
+def test_time_that_cores_are_idle_is_counted(module: ModuleType) -> None:
+    if not module.STAT.exists() or not hasattr(os, "sched_getaffinity"):
+        pytest.skip("this system does not count how long cores are idle")
+    cores = os.sched_getaffinity(0)
+    try:
+        every, start = module.idle(), time.perf_counter()
+        os.sched_setaffinity(0, {min(cores)})
+        one = module.idle()
+        while time.perf_counter() - start < 0.3:  # takes the core
+            pass
+        assert module.idle() - one < 0.15
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert (one < every) == (len(cores) > 1)
 
 
 @pytest.mark.parametrize(("threads", "device", "watched"), [(0, "cpu", 3), (2, "cpu", 1), (0, "cuda", 1)])
