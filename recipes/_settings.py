@@ -97,7 +97,7 @@ class Settings:
     seed: int = 0
     """Of weights, pairs, vertex orders and handles."""
     threads: int = 0
-    """Threads, 0 for torch's choice, and fewer where other programs take cores. At 1 a run repeats bit for bit."""
+    """Threads, 0 for torch's choice, and fewer while other programs take cores. At 1 a run repeats bit for bit."""
     precision: Literal["auto", "32-true", "bf16-mixed"] = "auto"
     """auto measures whether bfloat16 is faster here."""
     graph: bool = False
