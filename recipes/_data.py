@@ -287,6 +287,7 @@ def posed(cfg: Any, run: Run, workers: int, body: RiggedModel, split: Split) -> 
                 for what in ("identities", "poses"):
                     count = getattr(cfg, f"sampled_{what}")
                     key += f"{count} sampled {what}, " if count else ""
+                key += f"limbs stretched as a whole by {cfg.bone_spread}, " if cfg.bone_spread else ""
             key += f"pool {cfg.pool}, seed {cfg.seed}" if side == "train" else f"{len(listed)} pairs"
             stored = run.load_tensors(f"pool_{side}.safetensors", key)
             if stored is None:

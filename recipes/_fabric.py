@@ -26,6 +26,8 @@ def connect(cfg: S) -> tuple[Fabric, S]:
         cfg = replace(cfg, precision=pick_precision(Fabric(accelerator=cfg.accelerator, **shape(cfg)).device))
     fabric = Fabric(accelerator=cfg.accelerator, precision=cast(Any, cfg.precision), **shape(cfg))
     fabric.launch()
+    if cfg.threads:  # the launcher of several processes has shared out the cores
+        torch.set_num_threads(cfg.threads)
     if fabric.world_size > 1:
         share = fabric.all_reduce(torch.tensor(float(cfg.precision == "bf16-mixed"), device=fabric.device))
         if cast(torch.Tensor, share) not in (0, 1):

@@ -62,7 +62,7 @@ class Settings:
     """Further training identities, drawn from the Gaussian of the known ones; shipped and licensed rigs alone. Paper:
     SMAL's animals are drawn so."""
     bone_spread: float = 0.0
-    """Standard deviation of the logarithm by which limbs of the sampled identities are stretched. Paper: 0."""
+    """Standard deviation of the logarithm by which each limb of the sampled identities is stretched. Paper: 0."""
     sampled_poses: int = 0
     """Further training poses: the trunk of one of the known ones, each limb of another; rigs alone. Paper: none."""
     pool: int = 1200
@@ -97,7 +97,7 @@ class Settings:
     seed: int = 0
     """Of weights, pairs, vertex orders and handles."""
     threads: int = 0
-    """Threads, 0 for torch's choice, and fewer where other programs take cores. At 1 a run repeats bit for bit."""
+    """Threads, 0 for torch's choice, and fewer while other programs take cores. At 1 a run repeats bit for bit."""
     precision: Literal["auto", "32-true", "bf16-mixed"] = "auto"
     """auto measures whether bfloat16 is faster here."""
     graph: bool = False

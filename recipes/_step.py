@@ -60,7 +60,8 @@ class Trainer:
         self.fabric, self.system, self.optimizer = fabric, system, optimizer
         self.cfg, self.step, self.steps = cfg, step, steps
         self.graphed: GraphedStep | None = None
-        self.threads = Threads(told=cfg.threads > 0)
+        # Where a GPU computes, no thread spins for another; to take them away would only slow the evaluation down.
+        self.threads = Threads(stay=cfg.threads > 0 or fabric.device.type != "cpu")
 
     def update(self, batch: PairBatch, s: int) -> dict[str, float]:
         """One update; everything random in it follows from the seed, the step and the number of the process.

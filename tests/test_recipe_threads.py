@@ -3,13 +3,16 @@
 import os
 import subprocess
 import sys
-from types import ModuleType
+import time
+from dataclasses import replace
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
 from recipe_runs import ROOT, recipe_module
 
 pytest.importorskip("tqdm")
+pytest.importorskip("tyro")
 
 SPIN = """
 import os, sys, threading, time
@@ -42,7 +45,7 @@ def test_time_that_threads_wait_for_a_core_is_counted(module: ModuleType) -> Non
 
 
 @pytest.mark.parametrize(
-    ("told", "waiting", "left"),
+    ("stay", "waiting", "left"),
     [
         (False, [0.1], 4),
         (False, [1.1], 3),
@@ -56,7 +59,7 @@ def test_threads_without_cores_are_taken_away(
     module: ModuleType,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    told: bool,
+    stay: bool,
     waiting: list[float],
     left: int,
 ) -> None:
@@ -66,7 +69,7 @@ def test_threads_without_cores_are_taken_away(
     monkeypatch.setattr(module, "waited", lambda: total[0])
     monkeypatch.setattr(torch, "get_num_threads", lambda: number[0])
     monkeypatch.setattr(torch, "set_num_threads", lambda new: number.__setitem__(0, new))
-    threads = module.Threads(told=told, window=5.0)
+    threads = module.Threads(stay=stay, window=5.0)
     for share in waiting:
         for _ in range(3):  # steps of two seconds: the third is looked back from
             clock[0] += 2
@@ -76,3 +79,75 @@ def test_threads_without_cores_are_taken_away(
     said = capsys.readouterr().err
     assert ("going on with" in said) == (left < 4)
     assert f"going on with {left} of" in said or left == 4
+    assert said.count("--threads 4 keeps all") == said.count("going on with")
+
+
+def test_threads_come_back_when_cores_are_idle(
+    module: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As many as cores are idle, half a minute after they were taken away, and later each time."""
+    clock, total, free, number = [0.0], [0.0], [0.0], [4]
+    monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(module, "waited", lambda: total[0])
+    monkeypatch.setattr(module, "idle", lambda: free[0])
+    monkeypatch.setattr(torch, "get_num_threads", lambda: number[0])
+    monkeypatch.setattr(torch, "set_num_threads", lambda new: number.__setitem__(0, new))
+    threads = module.Threads(stay=False, window=5.0, patience=30.0)
+
+    def after(seconds: int, *, missing: float = 0.0, idle: float = 0.0) -> int:
+        for _ in range(seconds):
+            clock[0], total[0], free[0] = clock[0] + 1, total[0] + missing, free[0] + idle
+            threads.look()
+        return number[0]
+
+    assert after(40, idle=2.0) == 4 and capsys.readouterr().err == ""  # none to give back
+    assert after(5, missing=3.0) == 1
+    assert after(40, idle=0.6) == 1
+    assert after(5, idle=1.9) == 3
+    assert "cores are idle again: going on with 3 of 4 threads" in capsys.readouterr().err
+    assert after(55, idle=3.0) == 3
+    assert after(5, idle=3.0) == 4
+    assert after(5, missing=1.0, idle=3.0) == 3
+    assert after(115, idle=3.0) == 3
+    assert after(5, idle=3.0) == 4
+
+
+def test_time_that_cores_are_idle_is_counted(module: ModuleType) -> None:
+    if not module.STAT.exists() or not hasattr(os, "sched_getaffinity"):
+        pytest.skip("this system does not count how long cores are idle")
+    cores = os.sched_getaffinity(0)
+    try:
+        every, start = module.idle(), time.perf_counter()
+        os.sched_setaffinity(0, {min(cores)})
+        one = module.idle()
+        while time.perf_counter() - start < 0.3:  # takes the core
+            pass
+        assert module.idle() - one < 0.15
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert (one < every) == (len(cores) > 1)
+
+
+@pytest.mark.parametrize(("threads", "device", "watched"), [(0, "cpu", 3), (2, "cpu", 1), (0, "cuda", 1)])
+def test_threads_are_watched_where_they_compute_and_were_not_asked_for(
+    monkeypatch: pytest.MonkeyPatch, threads: int, device: str, watched: int
+) -> None:
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    fabric, cfg = SimpleNamespace(device=torch.device(device)), SimpleNamespace(threads=threads)
+    trainer = recipe_module("_step").Trainer(fabric, None, None, cfg, None, 1)
+    assert trainer.threads.number == watched
+
+
+def test_threads_that_were_asked_for_outlast_the_launch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The launcher of several processes gives each its share of the cores."""
+    fabric = pytest.importorskip("lightning_fabric").Fabric
+    before = torch.get_num_threads()
+    monkeypatch.setattr(fabric, "launch", lambda self: torch.set_num_threads(3))
+    settings = recipe_module("_settings").Settings(accelerator="cpu", precision="32-true", threads=2)
+    try:
+        recipe_module("_fabric").connect(settings)
+        assert torch.get_num_threads() == 2
+        recipe_module("_fabric").connect(replace(settings, threads=0))
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)

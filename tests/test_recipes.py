@@ -10,12 +10,13 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from recipe_runs import ROOT, read_json, read_log, recipe_module
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from meshkit.data import (
     MeshPool,
@@ -111,6 +112,21 @@ def test_corenet3d_may_be_told_the_matches(batch: PairBatch) -> None:
     unknown = replace(batch, correspondence=torch.full_like(batch.correspondence, -1))
     with pytest.raises(recipe_module("_run").UserError, match="--lambda-match needs true matches, which --data humans"):
         recipe.step(system, unknown, cfg, 0.0)
+
+
+def test_corenet3d_told_the_matches_may_be_recorded(batch: PairBatch) -> None:
+    """While a CUDA graph is recorded, which is at the first step, no condition may be read back."""
+
+    class Recorded(TorchDispatchMode):
+        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            assert func is not torch.ops.aten._local_scalar_dense.default or args[0].dtype != torch.bool
+            return func(*args, **(kwargs or {}))
+
+    recipe = recipe_module("corenet3d")
+    cfg = replace(small(recipe), lambda_match=1.0, graph=True)
+    _, system = recipe.build(cfg)
+    with Recorded():
+        assert "match" in recipe.step(system, batch, cfg, 0.0)
 
 
 def test_corenet3d_may_learn_the_matching_alone(batch: PairBatch) -> None:
@@ -339,6 +355,24 @@ def test_limbs_of_sampled_identities_are_stretched(run: Any, without_report: Non
     expected = scale_bones(before, joints_before, known.weights, known.parents, factors)
     assert torch.allclose(rest, expected[0], atol=1e-6) and torch.allclose(joints, expected[1], atol=1e-6)
     assert (rest - before).norm(dim=2).mean() > 0.02
+
+
+def test_signatures_of_other_limbs_are_not_taken(tmp_path: Path) -> None:
+    """A run that was killed before its first step may be begun again with other stretches, and has a pool by then."""
+    data, keys = recipe_module("_data"), []
+
+    class Asked(Exception):
+        pass
+
+    def asked(name: str, made_from: str) -> None:
+        keys.append((name, made_from))
+        raise Asked
+
+    for spread in (0.0, 0.2, 0.3):
+        cfg = replace(recipe_module("corenet3d").PRESETS["tiny"], sampled_identities=4, bone_spread=spread)
+        with pytest.raises(Asked):
+            data.data(cfg, SimpleNamespace(load_tensors=asked), 1)
+    assert len(set(keys)) == 3 and {name for name, _ in keys} == {"pool_train.safetensors"}
 
 
 def test_stretched_limbs_need_sampled_identities(run: Any) -> None:

@@ -164,7 +164,8 @@ def sample_bone_factors(
         joints: ``(J, 3)`` rest joints, left and right apart along x.
         parents: ``(J,)`` parent of each joint, -1 for the root; parents come first.
         count: how many bodies.
-        spread: standard deviation :math:`\sigma` of the logarithm of a limb's factors.
+        spread: standard deviation :math:`\sigma` of the logarithm by which a limb is stretched as a whole; that of a
+            factor is :math:`\sqrt{3/2}` times as large.
         generator: of the draws, which are made on its device; on the CPU if ``None``.
 
     Returns:
