@@ -19,9 +19,8 @@ class Threads:
     """Takes away threads that must wait for a core, and gives them back once cores are idle.
 
     PyTorch's threads wait for one another at the end of each operation, and spin meanwhile. Where another program has a
-    core, one spins for another that is not running: two threads on two cores, one of them taken, were 17 times
-    slower than one thread and more. Looks at :func:`waited` and :func:`idle`; nothing changes where the system does not count
-    these.
+    core, one spins for another that is not running: two threads on two cores, one of them taken, were 17 times slower
+    than one thread. Looks at :func:`waited` and :func:`idle`; nothing changes where the system does not count these.
 
     Args:
         stay: take none away: the number was asked for, or the steps are not computed by these threads.
