@@ -42,7 +42,8 @@ class Threads:
         if self.all == 1 or seconds < self.window:
             return
         before, self.began, self.waited, self.idle = (self.waited, self.idle), now, waited(), idle()
-        missing = math.ceil((self.waited - before[0]) / seconds - 0.25)  # cores, but for what passes
+        passing = max(0.25, 0.015 * self.number)  # cores that something else has for a moment
+        missing = math.ceil((self.waited - before[0]) / seconds - passing)
         spare = math.floor((self.idle - before[1]) / seconds + 0.25)
         had = self.number
         if missing > 0:
