@@ -599,7 +599,7 @@ def test_no_steps_make_no_more_of_the_training_pool_than_a_pair(
         ),
         ("npt", "corenet3d-humans", (), "architecture matching (here npt_maxpool); give weights of the same network"),
         ("xdualnet", "nobody", (), "--init nobody: neither shipped weights nor a folder are named so; there are coren"),
-        ("xdualnet", "corenet-human", (), "named so: did you mean corenet3d-humans? There are corenet3d-animals, coren"),
+        ("xdualnet", "corenet-human", (), "named so: did you mean corenet3d-humans? There are corenet3d-animals, c"),
         ("xdualnet", str(Path(__file__).parent), (), "holds no model.json: give the folder of a finished or checkp"),
     ],
 )
