@@ -44,9 +44,10 @@ def test_an_error_of_ones_own_build_keeps_its_traceback(tmp_path: Any) -> None:
 def test_an_error_of_ones_own_step_keeps_its_traceback(step: Any, kind: str) -> None:
     module = recipe_module("_step")
     batch = SimpleNamespace(identity_index=torch.tensor([7]), pose_index=torch.tensor([8]))
-    trainer = module.Trainer(SimpleNamespace(global_rank=0), None, SimpleNamespace(param_groups=[]), None, step, 9)
-    trainer.cfg = SimpleNamespace(seed=0)
-    trainer.gradients = lambda batch, s: step(None, batch, trainer.cfg, 0.0)
+    fabric = SimpleNamespace(global_rank=0, device=torch.device("cpu"))
+    cfg = SimpleNamespace(threads=1, seed=0)
+    trainer = module.Trainer(fabric, None, SimpleNamespace(param_groups=[]), cfg, step, 9)
+    trainer.gradients = lambda batch, s: step(None, batch, cfg, 0.0)
     with pytest.raises((ValueError, recipe_module("_run").UserError)) as caught:
         trainer.update(batch, 3)
     assert type(caught.value).__name__ == kind
