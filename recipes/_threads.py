@@ -55,7 +55,8 @@ class Threads:
             said = f"cores are idle again: going on with {self.number} of {self.all} threads"
         if self.number == had:
             return
-        self.patience *= 2 if self.number > had else 1
+        if self.number > had:
+            self.patience *= 2
         self.changed = now
         torch.set_num_threads(self.number)
         tqdm.write(said, file=sys.stderr)

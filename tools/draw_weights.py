@@ -80,7 +80,8 @@ def draw_matched(name: str, weights: str, kind: str, rows, ways, view) -> None:
     for row in rows:
         identity, pose, truth = load_pair(body, split.test_pairs[row])
         results = []
-        for net.generator.symmetry in ways.values():
+        for symmetry in ways.values():
+            net.generator.symmetry = symmetry
             results.append(net.output(identity, pose, identity_faces=body.faces, pose_faces=body.faces))
         colors = position_colors(pose[0])
         meshes, bounds = together([identity, pose, *(r.vertices for r in results), truth])
