@@ -25,7 +25,13 @@ from _tables_train import Job, command, jobs
 from meshkit.io import atomic_write
 
 KINDS = {"humans": "SMPL", "animals": "SMAL"}  # and the paper's bodies of that kind
-HEADS = {"pmd": "PMD (e-3)", "cd": "CD (e-3)", "emd": "EMD (e-2)", "match": "match error (e-2)"}
+HEADS = {
+    "pmd": "PMD (e-3)",
+    "cd": "CD (e-3)",
+    "emd": "EMD (e-2)",
+    "edges": "edges (%)",
+    "match": "match error (e-2)",
+}
 HEADS_OF_HUMANS = HEADS | {"match": "match error (cm)"}  # they are in metres
 TITLES = {
     "comparison-humans": "Table 1, humans (paper: SMPL)",
@@ -137,15 +143,19 @@ def plain(title: str, said: str, heads: list[str], rows: list[list[Any]]) -> str
     return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)]) + "\n"
 
 
+def given(cfg: Any) -> str:
+    """What every run was trained with."""
+    return f"{cfg.pairs} training pairs" if cfg.minutes is None else f"{cfg.minutes:g} minutes"
+
+
 def budget_text(tables: dict[str, list[Row]], cfg: Any, missing: list[Job]) -> str:
     """What the figures are of; words are explained where they are used."""
-    given = f"{cfg.pairs} training pairs" if cfg.minutes is None else f"{cfg.minutes} minutes"
     kinds = [kind for kind in KINDS if f"comparison-{kind}" in tables]
     sizes = {"humans": "humans with 1000 vertices", "animals": "animals with 1962"}
     units = {"humans": "of humans in centimetres", "animals": "of animals in hundredths of their unit"}
     sentences = [
-        f"Every system is trained with {given} (batch {cfg.batch}, preset `{cfg.preset}`) and measured on the same "
-        f"{cfg.eval_pairs} pairs of unseen identities in unseen poses (EMD: the first "
+        f"Every system is trained with {given(cfg)} (batch {cfg.batch}, preset `{cfg.preset}`) and measured on the "
+        f"same {cfg.eval_pairs} pairs of unseen identities in unseen poses (EMD: the first "
         f"{min(cfg.emd_pairs, cfg.eval_pairs)}), {', '.join(sizes[kind] for kind in kinds)}.",
     ]
     if any(row.runs > 1 for rows in tables.values() for row in rows):
@@ -156,6 +166,8 @@ def budget_text(tables: dict[str, list[Row]], cfg: Any, missing: list[Job]) -> s
             f"In brackets: the paper's figures, on {bodies}, after 24 to 90 GPU hours; the data differ, so only the "
             "order compares."
         )
+    if any("edges" in row.figures for rows in tables.values() for row in rows):
+        sentences.append("Edges: mean change of the lengths of edges from those of the ground truth.")
     if any("match" in row.figures for rows in tables.values() for row in rows):
         where = ", ".join(units[kind] for kind in kinds)
         sentences.append(f"Match error: distance between the matched and the true vertex, {where}.")
@@ -234,7 +246,7 @@ def write_tables(
     """tables.md, and a CSV file for each table; ``done`` are the runs they are of, ``drawn`` the sheets."""
     made_by = tables_command(cfg)
     missing = [job for job in jobs(tuple(KINDS), cfg.seeds) if job not in done]
-    parts = ["# The paper's tables\n", budget_text(tables, cfg, missing)]
+    parts = [f"# The paper's tables after {given(cfg)}\n", budget_text(tables, cfg, missing)]
     for name, rows in tables.items():
         heads = HEADS if name.endswith("animals") else HEADS_OF_HUMANS
         parts += [f"## {TITLES[name].format(large_pairs=cfg.large_pairs)}\n", table(rows, heads), order(rows)]

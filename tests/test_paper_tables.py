@@ -20,7 +20,7 @@ from safetensors.torch import save_file
 
 from meshkit.batching import center
 from meshkit.data import human_split, load_humans
-from meshkit.metrics import chamfer_distance, earth_movers_distance, pmd
+from meshkit.metrics import chamfer_distance, earth_movers_distance, edge_ratio, pmd
 from meshkit.models import GeneratorConfig
 
 pytest.importorskip("tyro")
@@ -77,8 +77,8 @@ def finished_run(folder: Path, seed: int, **changes: Any) -> torch.nn.Module:
 
 
 def figures_of(net: torch.nn.Module) -> dict[str, float]:
-    """PMD, Chamfer and earth mover's distance on the first test pairs, in the tables' units."""
-    body, found = load_humans(1000), {"pmd": [], "cd": [], "emd": []}
+    """PMD, Chamfer, changes of edges and earth mover's distance on the first test pairs, in the tables' units."""
+    body, found = load_humans(1000), {"pmd": [], "cd": [], "edges": [], "emd": []}
     for i, (a, p, b, q) in enumerate(human_split().test_pairs[:3].tolist()):
         who, how = torch.tensor([a, b, a]), torch.tensor([p, q, q])
         identity, pose, truth = center(body(who, how))[:, None]
@@ -86,6 +86,7 @@ def figures_of(net: torch.nn.Module) -> dict[str, float]:
             output = center(net(identity, pose).vertices)
         found["pmd"].append(1e3 * float(pmd(output, truth)))
         found["cd"].append(1e3 * float(chamfer_distance(output, truth)))
+        found["edges"].append(1e2 * float(edge_ratio(output, truth, body.faces)))
         if i < 2:
             found["emd"].append(1e2 * float(earth_movers_distance(output, truth)))
     return {name: sum(values) / len(values) for name, values in found.items()}
@@ -120,7 +121,7 @@ def test_tables_hold_means_and_spreads_over_runs(tables: Callable[..., Path], tm
         rows = {row["method"]: row for row in csv.DictReader(stream)}
     npt = rows["NPT"]
     assert npt["runs"] == "2"
-    for metric in ("pmd", "cd", "emd"):
+    for metric in ("pmd", "cd", "emd", "edges"):
         first, second = (figures[metric] for figures in direct)
         assert float(npt[f"{metric} mean"]) == pytest.approx((first + second) / 2, rel=1e-3)
         assert float(npt[f"{metric} spread"]) == pytest.approx(abs(first - second) / math.sqrt(2), rel=2e-2, abs=1e-3)
@@ -128,6 +129,7 @@ def test_tables_hold_means_and_spreads_over_runs(tables: Callable[..., Path], tm
     assert float(npt["pmd paper"]) == 2.77
     assert float(rows["deformation transfer"]["pmd mean"]) < float(rows["copy the identity"]["pmd mean"])
     text = (folder / "tables.md").read_text()
+    assert text.startswith("# The paper's tables after 8 training pairs\n"), "pages of several budgets are told apart"
     assert "humans corenet3d (2)" in text and "animals npt (2)" in text, "runs that are missing are named"
     assert "recipes/npt.py" in text and "--seed 1" in text
     assert "`±` is the standard deviation" in text
@@ -144,7 +146,8 @@ def test_words_are_explained_where_they_are_used(config: Any) -> None:
     single = {"comparison-humans": [row("cd", math.nan, 1)]}
     text = write.budget_text(single, config, [])
     assert "on SMPL, after" in text
-    assert not any(word in text for word in ("±", "animals", "SMAL", "Match error", "Runs that"))
+    assert not any(word in text for word in ("±", "animals", "SMAL", "Edges:", "Match error", "Runs that"))
+    assert "Edges: mean" in write.budget_text({"comparison-humans": [row("edges", math.nan, 1)]}, config, [])
     both = single | {"comparison-animals": [row("match", 0.1, 3)]}
     text = write.budget_text(both, config, [])
     for words in ("`±` is", "on SMPL and SMAL", "animals with 1962", "humans in centimetres, of animals in hundredths"):
