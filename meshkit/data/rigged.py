@@ -254,7 +254,7 @@ def _rows(table: Tensor | None, index: Tensor, what: str) -> Tensor:
 
 def _ancestors(parents: list[int]) -> Tensor:
     """Ancestor of each joint 1, 2, 4, ... levels up, until all are beyond the root, where one more joint stands."""
-    above = torch.tensor([*(p if p >= 0 else len(parents) for p in parents), len(parents)])
+    above = torch.tensor([*(p if p >= 0 else len(parents) for p in parents), len(parents)], device="cpu")
     rounds = []
     while bool((above < len(parents)).any()):
         rounds.append(above)

@@ -62,14 +62,12 @@ class PairSampler(Sampler[list[tuple[int, int]]]):
         return max(0, self.stop - self.start)
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        current, order = -1, torch.arange(self.length)
+        current, order = -1, torch.arange(self.length, device="cpu")
         for step in range(self.start, self.stop):
             epoch, place = divmod(step, self.steps_per_epoch)
             if self.shuffle and epoch != current:
-                current, order = (
-                    epoch,
-                    torch.randperm(self.length, generator=seeded(torch.Generator(), self.seed + 2, epoch, 0)),
-                )
+                dice = seeded(torch.Generator(), self.seed + 2, epoch, 0)
+                current, order = epoch, torch.randperm(self.length, generator=dice, device="cpu")
             begin = (place * self.world_size + self.rank) * self.batch_size
             yield [(epoch, int(i)) for i in order[begin : begin + self.batch_size]]
 
