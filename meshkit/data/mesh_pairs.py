@@ -80,7 +80,7 @@ class MeshPairs(Dataset[PairBatch]):
         pose_noise: float = 0.0,
         window: int | None = None,
     ) -> None:
-        if length < 1 or pose_noise < 0 or (window is not None and window < 1):
+        if not length >= 1 or not pose_noise >= 0 or (window is not None and not window >= 1):
             raise ValueError(
                 f"need length >= 1, pose_noise >= 0 and window >= 1, got {length}, {pose_noise} and {window}"
             )

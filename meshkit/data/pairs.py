@@ -82,7 +82,7 @@ class PosePairs(Dataset[PairBatch]):
         ground_truth: bool = True,
         pose_noise: float = 0.0,
     ) -> None:
-        if len(identities) == 0 or len(poses) == 0 or length < 1:
+        if len(identities) == 0 or len(poses) == 0 or not length >= 1:
             raise ValueError(
                 f"need identities, poses and a positive length, got {len(identities)}, {len(poses)} and {length}"
             )
@@ -102,7 +102,7 @@ class PosePairs(Dataset[PairBatch]):
             low, high = min(int(x.min()) for x in used), max(int(x.max()) for x in used)
             if not 0 <= low <= high < len(table):
                 raise ValueError(f"{name} must be in [0, {len(table)}), got {low} to {high}")
-        if pose_noise < 0 or (pose_noise > 0 and pool is not None):
+        if not pose_noise >= 0 or (pose_noise > 0 and pool is not None):
             raise ValueError(
                 f"pose_noise must be >= 0, and 0 with a pool, whose descriptors are of clean meshes; got {pose_noise}"
             )

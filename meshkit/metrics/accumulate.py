@@ -59,6 +59,8 @@ class MeanMetric:
     def __init__(
         self, function: Callable[..., Tensor], *, process_group: dist.ProcessGroup | None = None, **options: Any
     ) -> None:
+        if not callable(function):
+            raise TypeError(f"function must be a metric, such as meshkit.metrics.pmd, got {function!r}")
         _check_options(function, options)
         self.function = function
         self.options = options
