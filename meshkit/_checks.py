@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 def check_whole(value: Any, name: str, *, least: int = 1) -> None:
     """Check that a number of something is a whole number, not less than ``least``."""
-    if not isinstance(value, Integral) or value < least:
+    if not isinstance(value, Integral) or int(value) < least:
         raise ValueError(f"{name} must be a whole number, at least {least}, got {value!r}")
 
 
