@@ -19,7 +19,7 @@ def check_whole(value: Any, name: str, *, least: int = 1) -> None:
 def check_widths(widths: Any, name: str = "widths") -> None:
     """Check that the widths of layers are one or more positive whole numbers."""
     some = isinstance(widths, Sequence) and len(widths) > 0
-    if not some or not all(isinstance(width, Integral) and width > 0 for width in widths):
+    if not some or not all(isinstance(width, Integral) and int(width) > 0 for width in widths):
         given = tuple(widths) if isinstance(widths, Sequence) else widths
         raise ValueError(f"{name} must be at least one positive whole number of channels, as (64, 128), got {given!r}")
 
