@@ -2,10 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+
+def check_whole(value: Any, name: str, *, least: int = 1) -> None:
+    """Check that a number of something is a whole number, not less than ``least``."""
+    if not isinstance(value, Integral) or int(value) < least:
+        raise ValueError(f"{name} must be a whole number, at least {least}, got {value!r}")
+
+
+def check_widths(widths: Any, name: str = "widths") -> None:
+    """Check that the widths of layers are one or more positive whole numbers."""
+    some = isinstance(widths, Sequence) and len(widths) > 0
+    if not some or not all(isinstance(width, Integral) and int(width) > 0 for width in widths):
+        given = tuple(widths) if isinstance(widths, Sequence) else widths
+        raise ValueError(f"{name} must be at least one positive whole number of channels, as (64, 128), got {given!r}")
 
 
 def check_features(x: Any, *, name: str = "x", layout: str = "(B, N, C)") -> None:

@@ -22,11 +22,13 @@ def connect(cfg: S) -> tuple[Fabric, S]:
     """Fabric with its processes started, and the configuration with the precision that was picked."""
     from lightning_fabric import Fabric  # slow: --help, --apply and most refusals do without
 
+    if cfg.threads:  # precisions are timed with so many
+        torch.set_num_threads(cfg.threads)
     if cfg.precision == "auto":
         cfg = replace(cfg, precision=pick_precision(Fabric(accelerator=cfg.accelerator, **shape(cfg)).device))
     fabric = Fabric(accelerator=cfg.accelerator, precision=cast(Any, cfg.precision), **shape(cfg))
     fabric.launch()
-    if cfg.threads:  # the launcher of several processes has shared out the cores
+    if cfg.threads:  # again, as the launcher of several processes has shared out the cores
         torch.set_num_threads(cfg.threads)
     if fabric.world_size > 1:
         share = fabric.all_reduce(torch.tensor(float(cfg.precision == "bf16-mixed"), device=fabric.device))

@@ -120,10 +120,21 @@ def solver_from(cfg: Any) -> float:
     return float(cfg.arap_from) if getattr(cfg, "arap", False) else 1.0
 
 
+def seconds_of_step(trainer: Trainer, loader: Any, first: int) -> float:
+    """Time of an update, from five that begin at step ``first``."""
+    times = []
+    for s, batch in zip(range(first, first + 5), loader, strict=False):
+        start = time.perf_counter()
+        trainer.update(batch.to(trainer.fabric.device), s)
+        times.append(time.perf_counter() - start)
+    return sorted(times[1:])[1]
+
+
 def count_steps(trainer: Trainer, loader: Any) -> int:
     """Steps that fit into ``minutes``, from the speed of a few steps on copies that are thrown away.
 
-    They are timed at the beginning of a run, and at its end if a step changes in between, at ``arap_from``.
+    They are timed at the beginning of a run, and at its end if a step changes in between, at ``arap_from``; and anew
+    until :class:`~_threads.Threads` has looked and left their number as it is: steps may be many times slower before.
     """
     cfg, system, optimizer = trainer.cfg, trainer.system, trainer.optimizer
     if cfg.steps is not None:
@@ -131,14 +142,12 @@ def count_steps(trainer: Trainer, loader: Any) -> int:
     assert cfg.minutes is not None
     weights, moments = copy.deepcopy(system.state_dict()), copy.deepcopy(optimizer.state_dict())
     share = 1 - solver_from(cfg)
-    trainer.steps, seconds = 1000, []
-    for first in (0, 995) if share else (0,):
-        times = []
-        for s, batch in zip(range(first, first + 5), loader, strict=False):
-            start = time.perf_counter()
-            trainer.update(batch.to(trainer.fabric.device), s)
-            times.append(time.perf_counter() - start)
-        seconds.append(sorted(times[1:])[1])
+    trainer.steps, threads, settled = 1000, trainer.threads, False
+    while not settled:
+        number, began = threads.number, threads.began
+        seconds = [seconds_of_step(trainer, loader, first) for first in ((0, 995) if share else (0,))]
+        settled = threads.all == 1 or (threads.began != began and threads.number == number)
+        settled = trainer.fabric.broadcast(settled)  # processes exchange gradients: all go on, or none
     system.load_state_dict(weights)
     optimizer.load_state_dict(moments)
     steps = max(1, round(cfg.minutes * 60 / ((1 - share) * seconds[0] + share * seconds[-1])))

@@ -48,8 +48,6 @@ def train(cfg: Settings, build: Build, step: Step) -> None:
     """Train, evaluate, and leave pictures, meshes and figures in the run's folder."""
     keep_freed_memory()
     check(cfg)
-    if cfg.threads:
-        torch.set_num_threads(cfg.threads)
     run = Run(cfg.out / cfg.name, resume=cfg.resume)
     try:
         follow(cfg, build, step, run)

@@ -478,7 +478,7 @@ def test_pairs_are_addressed_by_epoch_and_number(key: Any, humans: RiggedModel) 
 
 
 def test_a_sampler_begins_at_a_step_from_0_on() -> None:
-    with pytest.raises(ValueError, match="start must be a step from 0 on, got -3"):
+    with pytest.raises(ValueError, match="start must be a whole number, at least 0, got -3"):
         PairSampler(10, 2, start=-3, stop=4)
 
 

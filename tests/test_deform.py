@@ -550,7 +550,7 @@ def with_nan(tensor: torch.Tensor) -> torch.Tensor:
         ({"init": "zero"}, "init must be \"rest\" or a tensor of positions, got 'zero'"),
         ({"init": VERTS[:4]}, r"init must have the shape of verts \(42, 3\), got \(4, 3\)"),
         ({"init": with_nan(VERTS)}, "init holds NaN or infinity"),
-        ({"max_iter": 0}, "max_iter must be at least 1, got 0"),
+        ({"max_iter": 0}, "max_iter must be a whole number, at least 1, got 0"),
         ({"tol": -1.0}, "tol must be at least 0, got -1.0"),
         ({"verts": VERTS.long()}, "verts must be a floating .* got torch.int64"),
         ({"verts": VERTS[:, :2]}, r"verts must be .* got torch.float64 \(42, 2\)"),

@@ -271,9 +271,9 @@ def test_pointwise_errors():
     with pytest.raises(TypeError, match=r"positions is torch.float64, but the parameters .* are torch.float32"):
         net(torch.zeros(1, 5, 3).double(), descriptors=torch.zeros(1, 5, 1))
     for widths in ((), (4, 0)):
-        with pytest.raises(ValueError, match="widths must be at least one positive number of channels"):
+        with pytest.raises(ValueError, match="widths must be at least one positive whole number"):
             PointwiseExtractor(widths)
-    with pytest.raises(ValueError, match="blocks must not be negative, got -1"):
+    with pytest.raises(ValueError, match="blocks must be a whole number, at least 0, got -1"):
         PointwiseExtractor((4,), blocks=-1)
     with pytest.raises(ValueError, match='extractor must be "setconv" or "pointwise", got \'dgcnn\''):
         PoseTransferGenerator(extractor="dgcnn")
@@ -394,7 +394,7 @@ def test_npt_errors():
     net, mesh = make_npt("original"), rand(2, 9, 3)
     with pytest.raises(ValueError, match='variant must be "maxpool" or "original", got \'mean\''):
         NPT("mean")
-    with pytest.raises(ValueError, match=r"encoder_widths must be positive, got \(3, 0\)"):
+    with pytest.raises(ValueError, match=r"encoder_widths must be .* positive whole number.*, got \(3, 0\)"):
         NPT(encoder_widths=(3, 0))
     with pytest.raises(ValueError, match="identity and pose batches differ"):
         net(mesh, mesh[:1])

@@ -395,7 +395,7 @@ NEAR = knn(POINTS, 4)
         (lambda e, c: c(POINTS, POINTS, NEAR[0]), ValueError, r"neighbors must have shape \(B, N, k\), got \(12, 4\)"),
         (lambda e, c: c(POINTS, POINTS[:1], NEAR), ValueError, "x, positions and neighbors must agree in B and N"),
         (lambda e, c: SetConvExtractor(()), ValueError, r"widths must be at least one positive .*got \(\)"),
-        (lambda e, c: SetConv(0, 3), ValueError, "in_features and out_features must be positive, got 0, 3"),
+        (lambda e, c: SetConv(0, 3), ValueError, "in_features must be a whole number, at least 1, got 0"),
     ],
 )
 def test_set_convolutions_name_what_does_not_fit(call, kind, message):

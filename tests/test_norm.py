@@ -832,6 +832,38 @@ def test_single_vertex_and_constant_channel_have_deviation_sqrt_eps(unbiased):
         assert_near(std, torch.full_like(std, 1e-2), 1e-14)
 
 
+@pytest.mark.parametrize("kind", NORMS)
+@pytest.mark.parametrize("fill", [0.0, math.nan])
+def test_a_batch_without_a_real_vertex_moves_nothing(kind, fill):
+    norm = make_any(kind).train()
+    norm(rand(2, 5, C), rand(2, 5, D, seed=1), mask=scattered_mask([3, 5], 5))  # running statistics other than 0 and 1
+    before = {name: value.clone() for name, value in norm.named_buffers()}
+    x, cond = (torch.full((2, 5, c), fill, dtype=torch.float64, requires_grad=True) for c in (C, D))
+    y = norm(x, cond, mask=torch.zeros(2, 5, dtype=torch.bool))
+    y.sum().backward()
+    assert not y.any() and not x.grad.any() and not cond.grad.any()
+    assert all(p.grad is None or not p.grad.any() for p in norm.parameters())
+    assert all(torch.equal(value, before[name]) for name, value in norm.named_buffers())
+
+
+@pytest.mark.parametrize(("dtype", "gate"), [(torch.float16, "sigmoid"), (torch.bfloat16, None)], ids=str)
+def test_elain_bears_large_features_in_half_precision(dtype, gate):
+    """Ungated, the result grows with the square of the features: too large for float16 is what float32 gives."""
+    norm = ElaIN(C, D, gate=gate)
+    x, cond = 1000 * (rand(2, 40, C) + 1), rand(2, 40, D, seed=1)
+    results = []
+    for kind in (torch.float32, dtype):
+        norm = norm.to(kind)
+        leaves = [t.to(dtype).to(kind).requires_grad_() for t in (x, cond)]
+        norm.zero_grad()
+        y = norm(*leaves)
+        y.backward(torch.full_like(y, 1e-3))
+        results.append([y, *(leaf.grad for leaf in leaves), *(p.grad for p in norm.parameters())])
+    assert (results[0][0].abs().amax() > 65504) == (gate is None)
+    assert all(value.isfinite().all() for value in results[1])
+    assert_near(results[1][0].float(), results[0][0], 0.02)
+
+
 def test_nothing_is_lost_to_cancellation():
     x = rand(1, 1000, 2, dtype=torch.float32) + 1000
     assert_near(instance_statistics(x)[1], instance_statistics(x.double())[1], 1e-5)

@@ -151,3 +151,41 @@ def test_threads_that_were_asked_for_outlast_the_launch(monkeypatch: pytest.Monk
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
+
+
+def test_threads_that_were_asked_for_time_the_precisions(monkeypatch: pytest.MonkeyPatch) -> None:
+    module, before, seen = recipe_module("_fabric"), torch.get_num_threads(), []
+    pytest.importorskip("lightning_fabric")
+    monkeypatch.setattr(module, "pick_precision", lambda _: seen.append(torch.get_num_threads()) or "32-true")
+    try:
+        module.connect(recipe_module("_settings").Settings(accelerator="cpu", precision="auto", threads=2))
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [2]
+
+
+@pytest.mark.parametrize(("fast", "slow"), [(0.05, 1.0), (2.0, 40.0), (0.05, 0.05)])
+def test_steps_are_counted_with_the_threads_of_the_run(
+    module: ModuleType, monkeypatch: pytest.MonkeyPatch, fast: float, slow: float
+) -> None:
+    """Two threads on one core are slow until one is taken away, which is seen after five seconds of steps or later."""
+    loop, now = recipe_module("_step"), [0.0]
+    clock = SimpleNamespace(perf_counter=lambda: now[0])
+    for part in (module, loop):
+        monkeypatch.setattr(part, "time", clock)
+    monkeypatch.setattr(module, "waited", lambda: now[0] if slow > fast else 0.0)  # one thread waits all the time
+    monkeypatch.setattr(module, "idle", lambda: 0.0)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(torch, "set_num_threads", lambda number: None)
+    nothing = SimpleNamespace(state_dict=dict, load_state_dict=lambda state: None)
+    fabric = SimpleNamespace(device=torch.device("cpu"), broadcast=lambda value: value)
+    cfg = SimpleNamespace(threads=0, steps=None, minutes=10.0)
+    trainer = loop.Trainer(fabric, nothing, nothing, cfg, None, 0)
+
+    def update(batch: torch.Tensor, s: int) -> None:
+        now[0] += fast if trainer.threads.number == 1 or slow == fast else slow
+        trainer.threads.look()
+
+    monkeypatch.setattr(trainer, "update", update)
+    steps = loop.count_steps(trainer, [torch.zeros(1)] * 5)
+    assert steps == round(600 / fast) and trainer.threads.number == (1 if slow > fast else 2)

@@ -53,7 +53,7 @@ def load_humans(num_verts: int = 1000) -> RiggedModel:
     def indices(name: str) -> Tensor:
         return torch.from_numpy(rig[name].astype(np.int64))
 
-    weights = torch.zeros(n, len(rig["joints"])).scatter_add_(1, indices(f"wi{n}"), array(f"ww{n}"))
+    weights = torch.zeros(n, len(rig["joints"]), device="cpu").scatter_add_(1, indices(f"wi{n}"), array(f"ww{n}"))
     return RiggedModel(
         array(f"v{n}"),
         indices(f"f{n}"),
@@ -104,7 +104,7 @@ def load_animals() -> RiggedModel:
         joints - mean_joints,
         torch.from_numpy(rig["W"].astype(np.float32)),
         torch.from_numpy(rig["parents"].astype(np.int64)),
-        identities=torch.eye(len(verts)),
+        identities=torch.eye(len(verts), device="cpu"),
         poses=(u @ vh).float(),
         identity_names=rig["names"].tolist(),
         pose_names=rig["pose_tag"].tolist(),
@@ -192,19 +192,22 @@ def animal_split() -> Split:
 
 def _split(name: str) -> Split:
     table = json.loads(_asset("splits.json").read_text())[name]
-    test_identities, test_poses = torch.tensor(table["test_identities"]), torch.tensor(table["test_poses"])
+
+    def rows(name: str) -> Tensor:
+        return torch.tensor(table[name], device="cpu")
 
     def others(count: int, taken: Tensor) -> Tensor:
-        keep = torch.ones(count, dtype=torch.bool)
+        keep = torch.ones(count, dtype=torch.bool, device="cpu")
         keep[taken] = False
         return keep.nonzero()[:, 0]
 
+    test_identities, test_poses = rows("test_identities"), rows("test_poses")
     return Split(
         others(table["identities"], test_identities),
         test_identities,
         others(table["poses"], test_poses),
         test_poses,
-        torch.tensor(table["test_pairs"]),
+        rows("test_pairs"),
     )
 
 

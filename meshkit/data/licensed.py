@@ -84,12 +84,12 @@ def load_smpl(
             _tensor(regressor @ template),
             _tensor(np.einsum("jv,vck->kjc", regressor, shapes)),
             _tensor(weights),
-            torch.tensor(parents),
+            torch.tensor(parents, device="cpu"),
             pose_correctives=_tensor(correctives.transpose(2, 0, 1)),
         )
     except ValueError as error:
         raise MeshFileError(f"{path}: {error}") from error
-    return turn_axes(model, torch.tensor(Y_UP_TO_Z_UP)) if z_up else model
+    return turn_axes(model, model.template.new_tensor(Y_UP_TO_Z_UP)) if z_up else model
 
 
 def load_smal(

@@ -80,7 +80,7 @@ class MeshPairs(Dataset[PairBatch]):
         pose_noise: float = 0.0,
         window: int | None = None,
     ) -> None:
-        if length < 1 or pose_noise < 0 or (window is not None and window < 1):
+        if not length >= 1 or not pose_noise >= 0 or (window is not None and not window >= 1):
             raise ValueError(
                 f"need length >= 1, pose_noise >= 0 and window >= 1, got {length}, {pose_noise} and {window}"
             )
@@ -91,7 +91,10 @@ class MeshPairs(Dataset[PairBatch]):
         self.listed = None if listed is None else list(listed)
         self.length = length if self.listed is None else len(self.listed)
         self.num_shards = int(store.shard.max()) + 1
-        self._choice: tuple[tuple[int, int] | None, _Choice] = (None, _Choice(store, torch.arange(len(store))))
+        self._choice: tuple[tuple[int, int] | None, _Choice] = (
+            None,
+            _Choice(store, torch.arange(len(store), device="cpu")),
+        )
         if self.listed is not None:
             self._check_listed()
         elif ground_truth:
@@ -110,15 +113,16 @@ class MeshPairs(Dataset[PairBatch]):
         """The pairs at one or several ``(epoch, i)``, as a batch."""
         addresses = addresses_of(address)
         store, dice = self.store, torch.Generator()
-        draws = torch.tensor([self._draw(dice, epoch if self.resample else 0, i) for epoch, i in addresses])
+        drawn = [self._draw(dice, epoch if self.resample else 0, i) for epoch, i in addresses]
+        draws = torch.tensor(drawn, device="cpu")
         a, b, c = draws.unbind(1)
         identity, identity_faces, mask_a = self._allocate(a)
         pose, pose_faces, mask_b = self._allocate(b)
         truth = torch.zeros_like(identity) if self.ground_truth else identity[:, :0]
-        match = torch.full(identity.shape[:2], -1)
+        match = torch.full(identity.shape[:2], -1, device="cpu")
         registered = (store.topology[a] == store.topology[b]).tolist()
         for row, (epoch, i) in enumerate(addresses):
-            k, m, t = draws[row].tolist()
+            k, m, t = drawn[row]
             orders = self._orders(dice, epoch, i, k, m)
             rank_b = _take(store, m, orders[1], pose[row], pose_faces[row])
             _take(store, k, orders[0], identity[row], identity_faces[row])
@@ -128,7 +132,8 @@ class MeshPairs(Dataset[PairBatch]):
                 torch.index_select(store.view("verts", t), 0, orders[0], out=truth[row, : len(orders[0])])
             if self.pose_noise > 0:
                 real = pose[row, : len(orders[1])]
-                real += self.pose_noise * torch.randn(real.shape, generator=seeded(dice, self.seed + 3, epoch, i))
+                seeded(dice, self.seed + 3, epoch, i)
+                real += self.pose_noise * torch.randn(real.shape, generator=dice, device="cpu")
         return PairBatch(
             identity=_shift(identity, store.center[a], mask_a),
             identity_faces=identity_faces,
@@ -145,16 +150,18 @@ class MeshPairs(Dataset[PairBatch]):
     def _allocate(self, meshes: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Room for vertices and faces of a batch, and the mask if they differ in number."""
         verts, faces = self.store.num_verts[meshes], self.store.num_faces[meshes]
-        most = int(verts.max())
-        mask = None if bool((verts == most).all()) else torch.arange(most) < verts[:, None]
-        return torch.zeros(len(meshes), most, 3), torch.full((len(meshes), int(faces.max()), 3), -1), mask
+        batch, most = len(meshes), int(verts.max())
+        mask = None if bool((verts == most).all()) else torch.arange(most, device="cpu") < verts[:, None]
+        points = torch.zeros(batch, most, 3, device="cpu")
+        return points, torch.full((batch, int(faces.max()), 3), -1, device="cpu"), mask
 
     def _orders(self, dice: torch.Generator, epoch: int, i: int, a: int, b: int) -> tuple[Tensor, Tensor]:
         num_a, num_b = int(self.store.num_verts[a]), int(self.store.num_verts[b])
         if not self.shuffle:
-            return torch.arange(num_a), torch.arange(num_b)
+            return torch.arange(num_a, device="cpu"), torch.arange(num_b, device="cpu")
         seeded(dice, self.seed + 1, epoch, i)
-        return torch.randperm(num_a, generator=dice), torch.randperm(num_b, generator=dice)
+        a_order = torch.randperm(num_a, generator=dice, device="cpu")
+        return a_order, torch.randperm(num_b, generator=dice, device="cpu")
 
     def _draw(self, dice: torch.Generator, epoch: int, i: int) -> tuple[int, int, int]:
         """Places of identity mesh, pose mesh and ground truth; the last is -1 without."""
@@ -164,7 +171,8 @@ class MeshPairs(Dataset[PairBatch]):
         if self.window is not None and self.window < self.num_shards:
             part = i * -(-self.num_shards // self.window) // self.length
             if self._choice[0] != (epoch, part):
-                order = torch.randperm(self.num_shards, generator=seeded(dice, self.seed + 4, epoch, 0))
+                seeded(dice, self.seed + 4, epoch, 0)
+                order = torch.randperm(self.num_shards, generator=dice, device="cpu")
                 shards = order[part * self.window : (part + 1) * self.window]
                 members = torch.isin(self.store.shard, shards).nonzero()[:, 0]
                 self._choice = ((epoch, part), _Choice(self.store, members))
@@ -212,7 +220,7 @@ class _Choice:
 
     def any_two(self, dice: torch.Generator) -> tuple[int, int]:
         """Two meshes, different if there are two."""
-        u, v, _ = torch.rand(3, generator=dice, dtype=torch.float64).tolist()
+        u, v, _ = torch.rand(3, generator=dice, dtype=torch.float64, device="cpu").tolist()
         count = len(self.members)
         a = int(u * count)
         return self.members[a], self.members[_other(v, 0, count, a)]
@@ -222,7 +230,7 @@ class _Choice:
 
         Wherever there are others, the pose is not the first mesh's, and the second mesh is not the third.
         """
-        u, v, w = torch.rand(3, generator=dice, dtype=torch.float64).tolist()
+        u, v, w = torch.rand(3, generator=dice, dtype=torch.float64, device="cpu").tolist()
         a = int(u * len(self.members))
         row = self.identity_row[a]
         place = _other(v, self.identity_start[row], self.identity_start[row + 1], self.in_identity[a])
@@ -248,7 +256,7 @@ def _groups(labels: Tensor) -> tuple[Tensor, Tensor]:
 def _take(store: MeshStore, k: int, order: Tensor, verts: Tensor, faces: Tensor) -> Tensor:
     """Write mesh k in another vertex order into the first rows; return where each of its vertices went."""
     torch.index_select(store.view("verts", k), 0, order, out=verts[: len(order)])
-    rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
+    rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device="cpu"))
     corners = store.view("faces", k).flatten()
     torch.index_select(rank, 0, corners, out=faces.view(-1)[: len(corners)])
     return rank
@@ -262,8 +270,8 @@ def _shift(verts: Tensor, centers: Tensor, mask: Tensor | None) -> Tensor:
 def _check_counts(store: MeshStore) -> None:
     """Every identity has one vertex count: its meshes are ground truth for each other."""
     row, _ = _groups(store.identity)
-    place = torch.arange(len(row))
-    first = torch.full((int(row.max()) + 1,), len(row)).scatter_reduce_(0, row, place, "amin")
+    place = torch.arange(len(row), device="cpu")
+    first = row.new_full((int(row.max()) + 1,), len(row)).scatter_reduce_(0, row, place, "amin")
     other = (store.num_verts != store.num_verts[first[row]]).nonzero()[:, 0]
     if len(other):
         a, b = store.entries[int(first[row[other[0]]])].path, store.entries[int(other[0])].path

@@ -82,7 +82,7 @@ class PosePairs(Dataset[PairBatch]):
         ground_truth: bool = True,
         pose_noise: float = 0.0,
     ) -> None:
-        if len(identities) == 0 or len(poses) == 0 or length < 1:
+        if len(identities) == 0 or len(poses) == 0 or not length >= 1:
             raise ValueError(
                 f"need identities, poses and a positive length, got {len(identities)}, {len(poses)} and {length}"
             )
@@ -102,7 +102,7 @@ class PosePairs(Dataset[PairBatch]):
             low, high = min(int(x.min()) for x in used), max(int(x.max()) for x in used)
             if not 0 <= low <= high < len(table):
                 raise ValueError(f"{name} must be in [0, {len(table)}), got {low} to {high}")
-        if pose_noise < 0 or (pose_noise > 0 and pool is not None):
+        if not pose_noise >= 0 or (pose_noise > 0 and pool is not None):
             raise ValueError(
                 f"pose_noise must be >= 0, and 0 with a pool, whose descriptors are of clean meshes; got {pose_noise}"
             )
@@ -149,31 +149,31 @@ class PosePairs(Dataset[PairBatch]):
     def _draw(self, addresses: Sequence[tuple[int, int]]) -> tuple[Tensor, Tensor, Tensor | None]:
         """Two meshes ``(2, B, 1 or 2)``, places in the pool or (identity, pose); vertex orders ``(2, B, N)``; noise."""
         batch, num, dice = len(addresses), len(self.model.template), torch.Generator()
-        meshes = torch.empty(2, batch, 2 if self.pool is None else 1, dtype=torch.int64)
-        orders = torch.arange(num).repeat(2, batch, 1)
-        noise = torch.empty(batch, num, 3) if self.pose_noise > 0 else None
+        meshes = torch.empty(2, batch, 2 if self.pool is None else 1, dtype=torch.int64, device="cpu")
+        orders = torch.arange(num, device="cpu").repeat(2, batch, 1)
+        noise = torch.empty(batch, num, 3, device="cpu") if self.pose_noise > 0 else None
         for b, (epoch, i) in enumerate(addresses):
             if self.listed is None:
                 self._pick(meshes[:, b], seeded(dice, self.seed, epoch if self.resample else 0, i))
             elif self.pool is None:
                 meshes[:, b] = self.listed[i].view(2, 2)
             else:
-                meshes[:, b, 0] = torch.tensor([2 * i, 2 * i + 1])
+                meshes[0, b, 0], meshes[1, b, 0] = 2 * i, 2 * i + 1
             if self.shuffle:
                 seeded(dice, self.seed + 1, epoch, i)
-                torch.randperm(num, generator=dice, out=orders[0, b])
-                torch.randperm(num, generator=dice, out=orders[1, b])
+                torch.randperm(num, generator=dice, out=orders[0, b], device="cpu")
+                torch.randperm(num, generator=dice, out=orders[1, b], device="cpu")
             if noise is not None:
-                torch.randn(num, 3, generator=seeded(dice, self.seed + 3, epoch, i), out=noise[b])
+                noise[b].normal_(generator=seeded(dice, self.seed + 3, epoch, i))
         return meshes, orders, noise
 
     def _pick(self, meshes: Tensor, dice: torch.Generator) -> None:
         if self.pool is None:
-            meshes[:, 0] = self.identities[torch.randint(len(self.identities), (2,), generator=dice)]
-            meshes[:, 1] = self.poses[torch.randint(len(self.poses), (2,), generator=dice)]
+            meshes[:, 0] = self.identities[torch.randint(len(self.identities), (2,), generator=dice, device="cpu")]
+            meshes[:, 1] = self.poses[torch.randint(len(self.poses), (2,), generator=dice, device="cpu")]
         else:  # two different meshes: the second is drawn from the others
-            a = int(torch.randint(len(self.pool), (), generator=dice))
-            b = int(torch.randint(len(self.pool) - 1, (), generator=dice))
+            a = int(torch.randint(len(self.pool), (), generator=dice, device="cpu"))
+            b = int(torch.randint(len(self.pool) - 1, (), generator=dice, device="cpu"))
             meshes[0, 0], meshes[1, 0] = a, b + (b >= a)
 
     def _assemble(self, meshes: Tensor, orders: Tensor, noise: Tensor | None) -> PairBatch:

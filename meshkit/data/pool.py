@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -81,8 +82,8 @@ class MeshPool:
         if len(identities) == 0 or len(poses) == 0:
             raise ValueError(f"need identities and poses to draw from, got {len(identities)} and {len(poses)}")
         generator = torch.Generator().manual_seed(seed)
-        identity = identities[torch.randint(len(identities), (size,), generator=generator)]
-        pose = poses[torch.randint(len(poses), (size,), generator=generator)]
+        identity = identities[torch.randint(len(identities), (size,), generator=generator, device="cpu")]
+        pose = poses[torch.randint(len(poses), (size,), generator=generator, device="cpu")]
         return cls.of(
             model,
             identity,
@@ -120,7 +121,7 @@ class MeshPool:
         else:
             with _one_thread_each(), ProcessPoolExecutor(workers, mp_context=context) as executor:
                 signatures = list(bar(executor.map(compute, [v.numpy() for v in verts], chunksize=8)))
-        return cls(identity, pose, verts, torch.stack([torch.as_tensor(s) for s in signatures]))
+        return cls(identity, pose, verts, torch.stack([torch.from_numpy(s) for s in signatures]))
 
     def state_dict(self) -> dict[str, Tensor]:
         """The four tensors, to be saved."""
@@ -154,8 +155,8 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _signature(verts: object, *, faces: Tensor, num_signatures: int, num_eigenpairs: int) -> object:
-    points = torch.as_tensor(verts)
+def _signature(verts: Tensor | np.ndarray, *, faces: Tensor, num_signatures: int, num_eigenpairs: int) -> np.ndarray:
+    points = verts if isinstance(verts, Tensor) else torch.from_numpy(verts)
     result = intrinsic_descriptors(
         points, faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs, method="fast"
     )

@@ -240,8 +240,10 @@ def check_shapes(expected: Mapping[str, tuple[Tensor | None, tuple[int, ...]]]) 
 
 def check_parents(parents: list[int]) -> None:
     """Check that the skeleton has one root, which comes first, and every joint comes after its parent."""
-    if parents[0] != -1 or not all(0 <= parent < joint for joint, parent in enumerate(parents[1:], 1)):
-        raise ValueError("joint 0 must be the root (parent -1) and every other joint must come after its parent")
+    if parents[:1] != [-1] or not all(0 <= parent < joint for joint, parent in enumerate(parents[1:], 1)):
+        raise ValueError(
+            f"joint 0 must be the root (parent -1) and every other joint must come after its parent, got {parents}"
+        )
 
 
 def _rows(table: Tensor | None, index: Tensor, what: str) -> Tensor:
@@ -254,7 +256,7 @@ def _rows(table: Tensor | None, index: Tensor, what: str) -> Tensor:
 
 def _ancestors(parents: list[int]) -> Tensor:
     """Ancestor of each joint 1, 2, 4, ... levels up, until all are beyond the root, where one more joint stands."""
-    above = torch.tensor([*(p if p >= 0 else len(parents) for p in parents), len(parents)])
+    above = torch.tensor([*(p if p >= 0 else len(parents) for p in parents), len(parents)], device="cpu")
     rounds = []
     while bool((above < len(parents)).any()):
         rounds.append(above)

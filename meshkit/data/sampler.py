@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from meshkit._checks import check_whole
 from meshkit.data.batch import PairBatch
 
 __all__ = ["PairSampler", "pair_loader"]
@@ -46,10 +47,13 @@ class PairSampler(Sampler[list[tuple[int, int]]]):
         world_size: int = 1,
         shuffle: bool = True,
     ) -> None:
-        if batch_size < 1 or not 0 <= rank < world_size:
-            raise ValueError(f"need a batch and 0 <= rank < world_size, got {batch_size}, {rank} and {world_size}")
-        if start < 0:
-            raise ValueError(f"start must be a step from 0 on, got {start}")
+        check_whole(length, "length", least=0)
+        check_whole(batch_size, "batch_size")
+        check_whole(world_size, "world_size")
+        for name, step in (("start", start), ("stop", stop)):
+            check_whole(step, name, least=0)
+        if not 0 <= rank < world_size:
+            raise ValueError(f"rank must be in [0, world_size), got {rank} of {world_size}")
         self.steps_per_epoch = length // (batch_size * world_size)
         if self.steps_per_epoch < 1:
             raise ValueError(
@@ -62,14 +66,12 @@ class PairSampler(Sampler[list[tuple[int, int]]]):
         return max(0, self.stop - self.start)
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        current, order = -1, torch.arange(self.length)
+        current, order = -1, torch.arange(self.length, device="cpu")
         for step in range(self.start, self.stop):
             epoch, place = divmod(step, self.steps_per_epoch)
             if self.shuffle and epoch != current:
-                current, order = (
-                    epoch,
-                    torch.randperm(self.length, generator=seeded(torch.Generator(), self.seed + 2, epoch, 0)),
-                )
+                dice = seeded(torch.Generator(), self.seed + 2, epoch, 0)
+                current, order = epoch, torch.randperm(self.length, generator=dice, device="cpu")
             begin = (place * self.world_size + self.rank) * self.batch_size
             yield [(epoch, int(i)) for i in order[begin : begin + self.batch_size]]
 

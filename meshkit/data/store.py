@@ -81,7 +81,7 @@ class MeshStore:
         self._spans = rows[:, 4:]
         self.num_verts = torch.from_numpy(self._spans[:, 1] - self._spans[:, 0])
         self.num_faces = torch.from_numpy(self._spans[:, 3] - self._spans[:, 2])
-        self.center = torch.tensor(index["centers"]).view(-1, 3)
+        self.center = torch.tensor(index["centers"], device="cpu").view(-1, 3)
         self._maps: OrderedDict[tuple[str, int], Tensor] = OrderedDict()
         for number in self.shard.unique().tolist():
             for kind in _DTYPES:
@@ -136,7 +136,7 @@ class MeshStore:
         bad: dict[int, tuple[str, str]] = {}
         topologies: dict[bytes, int] = {}
         shard = _Shard(cache, 0)
-        order = torch.randperm(len(entries), generator=torch.Generator().manual_seed(0)).tolist()
+        order = torch.randperm(len(entries), generator=torch.Generator().manual_seed(0), device="cpu").tolist()
         for k in tqdm(order, desc="meshes", unit="mesh", disable=not progress, dynamic_ncols=True):
             entry = entries[k]
             try:

@@ -32,8 +32,8 @@ class ARAPFactor:
         handles: (H,) indices of the handles.
 
     Raises:
-        ValueError: an unknown solver; handles out of range or repeated; a component that neither a handle nor a soft
-            weight holds.
+        ValueError: an unknown solver; handles out of range or repeated; soft weights of another shape, negative or
+            not finite; a component that neither a handle nor a soft weight holds.
         ImportError: the package of the solver is missing.
 
     Example:
@@ -54,6 +54,8 @@ class ARAPFactor:
         size = rest.topology.num_verts
         self.rest, self.handles = rest, handles.detach().cpu().long()
         _check_handles(self.handles, size)
+        if soft_weights is not None:
+            _check_soft(soft_weights, size)
         # weights of the energy over m, as the operators are
         self.soft = None if soft_weights is None else soft_weights.detach().cpu().double() / rest.topology.multiplicity
         _check_held(rest, self.handles, self.soft)
@@ -62,16 +64,10 @@ class ARAPFactor:
         self.stiffness = rest.laplacian
         if self.soft is not None:
             self.stiffness = (rest.laplacian + sparse.diags_array(self.soft.numpy())).tocsr()
-        self._free = np.flatnonzero(is_free)
-        self.free = torch.from_numpy(self._free)
+        self.free = torch.from_numpy(np.flatnonzero(is_free))
         self.solve: Callable[[Any], Any] = _empty
-        if len(self._free):
+        if len(self.free):
             self.solve = _MAKERS[solver](_block(self.stiffness, is_free))
-
-    @property
-    def coupling(self) -> Any:
-        """Block of the free rows and the handle columns."""
-        return self.stiffness[self._free][:, self.handles.numpy()]
 
 
 def check_choice(name: str, value: str, known: tuple[str, ...]) -> None:
@@ -88,6 +84,14 @@ def _check_handles(handles: Tensor, size: int) -> None:
     repeated = len(handles) - len(handles.unique())
     if repeated:
         raise ValueError(f"{repeated} handles repeat an earlier one of the same mesh; list each vertex once")
+
+
+def _check_soft(weights: Tensor, size: int) -> None:
+    if weights.shape != (size,):
+        raise ValueError(f"soft_weights must have shape ({size},), got {tuple(weights.shape)}")
+    if not bool(((weights >= 0) & weights.isfinite()).all()):
+        low, high = float(weights.min()), float(weights.max())
+        raise ValueError(f"soft_weights must be finite and at least 0, got a range of [{low}, {high}]")
 
 
 def _check_held(rest: ARAPRest, handles: Tensor, soft: Tensor | None) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from meshkit._checks import check_whole
 from meshkit.deform.factor import SOLVERS, check_choice
 
 __all__ = ["ARAPInfo", "Options", "check_options"]
@@ -70,8 +71,7 @@ def check_options(
     check_choice("solver", solver, SOLVERS)
     if grad == "unroll" and method != "local_global":
         raise ValueError('grad="unroll" needs method="local_global"; "lbfgs" goes with grad="implicit"')
-    if max_iter < 1:
-        raise ValueError(f"max_iter must be at least 1, got {max_iter}")
+    check_whole(max_iter, "max_iter")
     if not tol >= 0:
         raise ValueError(f"tol must be at least 0, got {tol}")
     if not 0 < grad_tol < 1:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from meshkit._checks import check_whole
 from meshkit.topology import check_faces
 
 __all__ = ["ENERGIES", "ARAPTopology"]
@@ -47,6 +48,7 @@ class ARAPTopology:
         import numpy as np
 
         check_energy(energy)
+        check_whole(num_verts, "num_verts", least=0)
         check_faces(faces, num_verts)
         faces = faces.detach().cpu().long()
         self.faces = faces[faces[:, 0] >= 0]

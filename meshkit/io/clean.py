@@ -61,7 +61,7 @@ class CleanMesh:
     @cached_property
     def _dropped(self) -> SurfaceBinding:
         points = self.original[self.target.to(self.original.device) < 0].cpu()
-        loose = torch.arange(len(points))[:, None].expand(-1, 3)  # each on its own: a point as a face
+        loose = torch.arange(len(points), device="cpu")[:, None].expand(-1, 3)  # each on its own: a point as a face
         return SurfaceBinding(points, loose, self.verts, self.faces)
 
     def __str__(self) -> str:

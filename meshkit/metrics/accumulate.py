@@ -59,6 +59,8 @@ class MeanMetric:
     def __init__(
         self, function: Callable[..., Tensor], *, process_group: dist.ProcessGroup | None = None, **options: Any
     ) -> None:
+        if not callable(function):
+            raise TypeError(f"function must be a metric, such as meshkit.metrics.pmd, got {function!r}")
         _check_options(function, options)
         self.function = function
         self.options = options
@@ -92,7 +94,7 @@ class MeanMetric:
             float64 (float32 on devices without it), a scalar or ``(K,)``; NaN if there were no samples. The state stays
             as it is, so that more may be added.
         """
-        total, count = self._total, torch.tensor(self._count, dtype=torch.float64)
+        total, count = self._total, torch.tensor(self._count, dtype=torch.float64, device="cpu")
         if dist.is_available() and dist.is_initialized():
             total, count = self._reduced(total, count)
         return count.new_full((), torch.nan) if total is None else total / count.to(total)

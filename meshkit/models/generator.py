@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
+from meshkit._checks import check_whole, check_widths
 from meshkit._repr import settings
 from meshkit.batching import masked_mean
 from meshkit.deform import poisson_deform, rigid_moving_least_squares
@@ -121,8 +122,9 @@ class PoseTransferGenerator(nn.Module):
         counts: tuple[Any, ...] = (n_iters, k)
         if not all(isinstance(count, Integral) for count in counts):  # 5.0 would be refused only in the forward pass
             raise ValueError(f"n_iters and k must be whole numbers, got {n_iters} and {k}")
-        if not widths or not extractor_widths or min(*widths, *extractor_widths) < 1:
-            raise ValueError(f"widths must be positive, got {extractor_widths} and {widths}")
+        check_widths(widths)
+        check_widths(extractor_widths, "extractor_widths")
+        check_whole(descriptors, "descriptors", least=0)
         if extractor not in ("setconv", "pointwise"):
             raise ValueError(f'extractor must be "setconv" or "pointwise", got {extractor!r}')
         if condition not in ("features", "descriptors"):

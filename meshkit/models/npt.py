@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
+from meshkit._checks import check_widths
 from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.models.output import GeneratorOutput
@@ -60,8 +61,7 @@ class NPT(nn.Module):
         super().__init__()
         if variant not in ("maxpool", "original"):
             raise ValueError(f'variant must be "maxpool" or "original", got {variant!r}')
-        if not encoder_widths or min(encoder_widths) < 1:
-            raise ValueError(f"encoder_widths must be positive, got {tuple(encoder_widths)}")
+        check_widths(encoder_widths, "encoder_widths")
         self.variant = variant
         self.encoder = _PoseEncoder(encoder_widths)
         self.decoder = _Decoder(encoder_widths[-1], bare_start=variant == "maxpool")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, normalize
 
-from meshkit._checks import check_descriptors, check_dtype
+from meshkit._checks import check_descriptors, check_dtype, check_whole, check_widths
 from meshkit._repr import settings
 from meshkit.batching import check_mask, check_verts
 from meshkit.norm import instance_norm
@@ -58,10 +58,11 @@ class PointwiseExtractor(nn.Module):
         self, widths: Sequence[int] = (64, 128, 256), *, blocks: int = 4, descriptors: int = 0, slope: float = 0.2
     ) -> None:
         super().__init__()
-        if not widths or min(widths) < 1:
-            raise ValueError(f"widths must be at least one positive number of channels, got {tuple(widths)}")
-        if blocks < 0:
-            raise ValueError(f"blocks must not be negative, got {blocks}")
+        check_widths(widths)
+        check_whole(blocks, "blocks", least=0)
+        check_whole(descriptors, "descriptors", least=0)
+        if not slope >= 0:
+            raise ValueError(f"slope must not be negative, got {slope}")
         self.descriptors, self.out_features, self.slope = descriptors, widths[-1], slope
         self.linears = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise([3 + descriptors, *widths]))
         self.blocks = nn.ModuleList(_ResidualBlock(widths[-1]) for _ in range(blocks))

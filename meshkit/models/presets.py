@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 from meshkit.models.generator import PoseTransferGenerator
 from meshkit.models.npt import NPT
 
@@ -202,7 +204,8 @@ def load_generator(folder: str | Path) -> tuple[PoseTransferGenerator | NPT, Gen
     except ValueError as error:
         raise ValueError(f"{folder / 'model.json'}: {error}") from error
     try:
-        model = config.build()
+        with torch.device("cpu"):  # read there whatever the default device
+            model = config.build()
         model.load_state_dict(load_file(folder / "model.safetensors"))
     except Exception as error:  # torch, safetensors and load_state_dict each raise their own kinds
         reason = (str(error).splitlines() or [repr(error)])[0]

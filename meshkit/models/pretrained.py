@@ -257,6 +257,7 @@ def load_pretrained(name: str, *, device: torch.device | str = "cpu") -> Pretrai
     folder = weights_folder()
     config = GeneratorConfig.from_json(json.dumps(card["model"]))
     state = load((folder / f"{name}.safetensors").read_bytes())
-    generator = config.build()
+    with torch.device("cpu"):  # read there whatever the default device, then moved
+        generator = config.build()
     generator.load_state_dict({key: v.float() if v.is_floating_point() else v for key, v in state.items()})
     return PretrainedTransfer(generator, config, card=card).to(device).eval()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from meshkit._checks import check_widths
 from meshkit._repr import settings
 from meshkit.nn import ConditionalResBlock
 from meshkit.norm import ElaIN
@@ -26,6 +27,9 @@ class PoseTransferStack(nn.Module):
         norm: conditional norm of the blocks, see :class:`~meshkit.nn.ConditionalResBlock`.
         spectral: spectral normalisation in the blocks.
         residual: add the warped mesh to the output: the stack then learns a displacement.
+
+    Raises:
+        ValueError: no ``widths``, or a number of channels that is not a positive whole number.
 
     Shape:
         ``warped (B, N, 3)``, ``features (B, N, D)``, ``mask (B, N)``; the result is ``(B, N, 3)``.
@@ -48,6 +52,7 @@ class PoseTransferStack(nn.Module):
         residual: bool = False,
     ) -> None:
         super().__init__()
+        check_widths(widths)
         self.residual = residual
         self.lift = nn.Linear(3, widths[0])
         self.mix = nn.Linear(widths[0], widths[0])

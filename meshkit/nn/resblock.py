@@ -64,7 +64,7 @@ class ConditionalResBlock(nn.Module):
         spectral: bool = True,
     ) -> None:
         super().__init__()
-        if slope < 0:
+        if not slope >= 0:
             raise ValueError(f"slope must not be negative, got {slope}")
         if not callable(norm) or isinstance(norm, nn.Module):
             raise ValueError(

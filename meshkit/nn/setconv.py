@@ -9,7 +9,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from meshkit._checks import check_channels, check_descriptors, check_dtype, check_features
+from meshkit._checks import check_channels, check_descriptors, check_dtype, check_features, check_whole, check_widths
 from meshkit._repr import settings
 from meshkit.batching import check_mask
 from meshkit.neighbors import gather_vertices, knn
@@ -73,8 +73,8 @@ class SetConv(nn.Module):
         super().__init__()
         if not slope >= 0:
             raise ValueError(f"slope must not be negative (the maximum is taken before the activation), got {slope}")
-        if in_features < 1 or out_features < 1:
-            raise ValueError(f"in_features and out_features must be positive, got {in_features}, {out_features}")
+        check_whole(in_features, "in_features")
+        check_whole(out_features, "out_features")
         self.slope, self.in_features, self.out_features, self.recompute = slope, in_features, out_features, recompute
         self.relative_gradient = relative_gradient
         widths = [in_features + 3, out_features, out_features, out_features]
@@ -207,7 +207,8 @@ class SetConvExtractor(nn.Module):
         ``positions (B, N, 3)``, ``descriptors (B, N, D)`` or ``None``, ``mask (B, N)``; result ``(B, N, widths[-1])``.
 
     Raises:
-        ValueError: descriptors missing, unexpected or of the wrong shape; fewer than ``k`` vertices.
+        ValueError: no widths, or numbers of channels or neighbours that are no positive whole numbers; descriptors
+            missing, unexpected or of the wrong shape; fewer than ``k`` vertices.
         TypeError: no tensors, or ``positions`` and the parameters in two dtypes.
 
     Example:
@@ -225,8 +226,9 @@ class SetConvExtractor(nn.Module):
         relative_gradient: bool = False,
     ) -> None:
         super().__init__()
-        if not widths or min(widths) < 1:
-            raise ValueError(f"widths must be at least one positive number of channels, got {tuple(widths)}")
+        check_widths(widths)
+        check_whole(k, "k")
+        check_whole(descriptors, "descriptors", least=0)
         self.k, self.descriptors, self.out_features = k, descriptors, widths[-1]
         inputs = [3 + descriptors, *widths[:-1]]
         options = {"recompute": recompute, "relative_gradient": relative_gradient}

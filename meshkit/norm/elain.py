@@ -78,6 +78,10 @@ class ElaIN(ConditionalNorm):
     with the condition, and no C x C product runs per vertex. Parameters stay those of the equations; only the order
     of evaluation differs.
 
+    Statistics are float32 or better in any dtype. Without a gate w is linear in the mean of ``x``, so the result grows
+    with the square of ``x``: in float16, which ends at 65504, a mean or deviation of some hundreds may overflow. Take
+    ``gate="sigmoid"``, under which it grows in proportion, or bfloat16.
+
     Args:
         num_features: channels C of ``x``.
         cond_features: channels D of ``cond``.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from meshkit._checks import check_whole
 from meshkit._repr import settings
 from meshkit.norm.base import ConditionalNorm
 from meshkit.norm.modulation import Modulation
@@ -48,15 +49,15 @@ def batch_statistics(x: Tensor, *, mask: Tensor | None = None) -> tuple[Tensor, 
         mask: ``(B, N)`` bool, True = real vertex.
 
     Returns:
-        ``mean (C,)``, ``var (C,)`` and ``count ()``, in float32 or better.
+        ``mean (C,)``, ``var (C,)`` and ``count ()``, in float32 or better; all 0 without a real vertex.
     """
     x = x.flatten(0, 1).to(torch.promote_types(x.dtype, torch.float32))
     if mask is None:
         return x.mean(0), x.var(0, correction=0), x.new_tensor(len(x))
     real = mask.flatten()[:, None]
-    count = real.sum().clamp_min(1).to(x.dtype)
-    mean = torch.where(real, x, 0).sum(0) / count
-    return mean, torch.where(real, x - mean, 0).square().sum(0) / count, count
+    count = real.sum().to(x.dtype)
+    mean = torch.where(real, x, 0).sum(0) / count.clamp_min(1)
+    return mean, torch.where(real, x - mean, 0).square().sum(0) / count.clamp_min(1), count
 
 
 class SPADE(ConditionalNorm):
@@ -64,7 +65,7 @@ class SPADE(ConditionalNorm):
 
     :func:`spade` with :math:`h = \mathrm{ReLU}(W_s c + b_s)`, :math:`\gamma = W_\gamma h + b_\gamma` and
     :math:`\beta = W_\beta h + b_\beta`. In training, mean and variance are those of all real vertices of the batch,
-    and running ones are kept; evaluation takes the running ones.
+    and running ones are kept; evaluation takes the running ones. A batch without a real vertex does not move them.
 
     Args:
         num_features: channels C of ``x``.
@@ -77,7 +78,7 @@ class SPADE(ConditionalNorm):
         As :class:`ConditionalNorm`, with one row of ``cond`` per vertex of ``x``.
 
     Raises:
-        ValueError: shapes that do not fit.
+        ValueError: shapes that do not fit, ``hidden`` below 1, or ``momentum`` outside [0, 1].
 
     Reference:
         Park et al., "Semantic image synthesis with spatially-adaptive normalization", Equation 1.
@@ -99,6 +100,9 @@ class SPADE(ConditionalNorm):
         self, num_features: int, cond_features: int, *, hidden: int = 128, momentum: float = 0.1, eps: float = 1e-5
     ) -> None:
         super().__init__(num_features, cond_features, eps=eps)
+        check_whole(hidden, "hidden")
+        if not 0 <= momentum <= 1:
+            raise ValueError(f"momentum is a share, from 0 to 1, got {momentum}")
         self.momentum = momentum
         self.shared = nn.Linear(cond_features, hidden)
         self.gamma = nn.Linear(hidden, num_features)
@@ -118,9 +122,10 @@ class SPADE(ConditionalNorm):
             mean, var, count = batch_statistics(x, mask=mask)
             with torch.no_grad():
                 unbiased = var * (count / (count - 1).clamp_min(1))
-                self.running_mean.lerp_(mean.to(self.running_mean.dtype), self.momentum)
-                self.running_var.lerp_(unbiased.to(self.running_var.dtype), self.momentum)
-                self.num_batches_tracked += 1
+                some = count > 0  # without a real vertex there is nothing to learn from
+                for running, new in ((self.running_mean, mean), (self.running_var, unbiased)):
+                    running.lerp_(new.to(running.dtype), self.momentum * some.to(running.dtype))
+                self.num_batches_tracked += some
         shape = (len(x), 1, -1)
         return mean.expand(shape), (var + self.eps).sqrt().expand(shape)
 

@@ -17,7 +17,7 @@ def axis_vector(axis: str) -> Tensor:
     sign, letter = (axis[0], axis[1:]) if axis[:1] in "+-" else ("+", axis)
     if letter not in ("x", "y", "z"):
         raise ValueError(f"an axis is +x, -x, +y, -y, +z or -z, got {axis!r}")
-    vector = torch.zeros(3)
+    vector = torch.zeros(3, device="cpu")
     vector["xyz".index(letter)] = -1.0 if sign == "-" else 1.0
     return vector
 
@@ -39,8 +39,8 @@ def rotations(up: str | None = None, facing: str | None = None) -> Tensor:
     found = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = torch.zeros(3, 3)
-            matrix[range(3), order] = torch.tensor(signs)
+            matrix = torch.zeros(3, 3, device="cpu")
+            matrix[range(3), order] = matrix.new_tensor(signs)
             fits = torch.linalg.det(matrix) > 0
             fits &= up is None or bool((matrix[2] == axis_vector(up)).all())
             fits &= facing is None or bool((matrix[1] == -axis_vector(facing)).all())
@@ -52,7 +52,7 @@ def rotations(up: str | None = None, facing: str | None = None) -> Tensor:
 
 def turns_about(rotation: Tensor) -> Tensor:
     """A rotation (3, 3) and the six that are a quarter turn away: (7, 3, 3), itself first."""
-    quarters = [torch.eye(3), *(turn for turn in rotations() if abs(float(turn.trace()) - 1) < 0.5)]
+    quarters = [torch.eye(3, device="cpu"), *(turn for turn in rotations() if abs(float(turn.trace()) - 1) < 0.5)]
     return torch.stack(quarters).to(rotation) @ rotation
 
 
@@ -64,8 +64,8 @@ def among(turns: Tensor, others: Tensor) -> Tensor:
 def turn_up(source: Tensor, target: Tensor) -> Tensor:
     """The least rotation (3, 3) along the axes that takes one up axis to another."""
     if bool((source == target).all()):
-        return torch.eye(3)
+        return torch.eye(3, dtype=source.dtype, device=source.device)
     axis = torch.linalg.cross(source, target)
     if not bool(axis.any()):  # opposite: a half turn about x, or about y if x is up
-        return torch.diag(torch.tensor([1.0, -1, -1] if source[0] == 0 else [-1.0, 1, -1]))
+        return torch.diag(source.new_tensor([1, -1, -1] if source[0] == 0 else [-1, 1, -1]))
     return torch.outer(axis, axis) + torch.outer(target, source) - torch.outer(source, target)

@@ -89,8 +89,8 @@ def guess_kind(verts: Tensor, faces: Tensor) -> Likeness:
         faces: (F, 3), turned outward.
     """
     people, animals = kind_distances(shape_numbers(verts, faces))
-    whitening = torch.tensor(_WHITENING).double()
-    apart = float((whitening @ (torch.tensor(_MEANS[0]) - torch.tensor(_MEANS[1])).double()).square().sum())
+    means = torch.tensor(_MEANS, dtype=torch.float64, device="cpu")
+    apart = kind_distances(means[0])[1] ** 2
     score = (people**2 - animals**2) / apart
     return Likeness("animals" if score >= _CLEAR else "humans", score, min(people, animals))
 

@@ -90,7 +90,7 @@ def boundary_loops(verts: Tensor, faces: Tensor) -> Loops:
     ends = directed_edges(triangles)[np.bincount(number)[number] == 1]
     used, row = np.unique(ends, return_inverse=True)
     if len(used) == 0:
-        return Loops(*torch.empty(3, 0, dtype=torch.float64))
+        return Loops(*torch.empty(3, 0, dtype=torch.float64, device="cpu"))
     row = row.reshape(-1, 2)
     label = components(row, len(used))
     loop, count = label[row[:, 0]], int(label.max()) + 1

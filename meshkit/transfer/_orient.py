@@ -125,7 +125,7 @@ def choose(rows: Tensor, favoured: Tensor, *, doubt: float) -> tuple[int, bool]:
     """
     score = rows[:, 0] + rows[:, 1] / 8
     best = int((score + _CLEAR * favoured).argmax())
-    others = score[torch.arange(len(score)) != best]
+    others = score[torch.arange(len(score), device=score.device) != best]
     return best, bool(score[best] - others.max() > doubt)
 
 
@@ -153,7 +153,7 @@ def agreements(
         there = plan.barycentric(rest.surface)[0].to(turned)
         like = _correlation(turned - turned.mean(0), there[:, :3] - there[:, :3].mean(0))
         rows.append((_correlation(normals @ rotation.T, there[:, 3:]), like - _mean_row_entropy(plan)))
-    return torch.tensor(rows)
+    return torch.tensor(rows, device="cpu")
 
 
 def _mean_row_entropy(plan: TransportPlan | DensePlan) -> float:

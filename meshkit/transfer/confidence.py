@@ -198,6 +198,6 @@ def usual_range(measured: Sequence[Confidence], *, quantile: float = 0.99) -> di
 def bounds(name: str, values: Sequence[float], *, quantile: float = 0.99) -> dict[str, float]:
     """Median and limit of one number, a field of :class:`Confidence`, over ordinary pairs."""
     high_is_odd = {field: high for field, high, *_ in _MEANINGS}[name]
-    numbers = torch.tensor(values, dtype=torch.float64)
+    numbers = torch.tensor(values, dtype=torch.float64, device="cpu")
     limit = numbers.quantile(quantile if high_is_odd else 1 - quantile)
     return {"median": round(float(numbers.median()), 5), "limit": round(float(limit), 5)}

@@ -229,7 +229,7 @@ class _Check:
     """Says of one pose after the other whether it can be used; it keeps no mesh but the faces of one."""
 
     def __init__(self) -> None:
-        self._shape, self._faces = torch.Size(), torch.empty(0)
+        self._shape, self._faces = torch.Size(), torch.empty(0, device="cpu")
 
     def __call__(self, number: int, mesh: Mesh) -> str | None:
         """What is wrong with a pose, after its name; ``None`` if nothing is."""
