@@ -1456,10 +1456,11 @@ def test_an_animal_in_meshkits_own_frame_is_not_in_doubt(name):
 
 
 @pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
-def test_the_page_runs(capsys):
+def test_the_page_runs(capsys, tmp_path, monkeypatch):
     page = Path(__file__).parents[1] / "docs" / "transfer.md"
     blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
     names: dict[str, object] = {}
+    monkeypatch.chdir(tmp_path)
     exec(compile("\n".join(blocks), page.name, "exec"), names)
     assert "unit cm (guessed from the surface area)" in capsys.readouterr().out
     assert 1e3 * float(pmd(names["result"].verts[None], center(names["target"]))[0]) < BOUND
