@@ -175,6 +175,11 @@ def drawn_split(identities: int, poses: int, draw: torch.Generator) -> Split:
 def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, MeshPairs]:
     """Pairs of meshes from files: the released split where their numbers are those of a released data set."""
     if cfg.model.descriptors != "none":
+        if cfg.init is not None:  # without the descriptors its network would be another one
+            raise UserError(
+                f"meshes from files come without signatures: --init {cfg.init} goes with them only if those weights "
+                "take none (--model.descriptors none), as no shipped ones do; docs/recipes.md has a loop for these"
+            )
         raise UserError("meshes from files come without signatures: add --model.descriptors none")
     for name in ("humans", "animals"):
         train, test = (RELEASED_SPLITS[f"{name}-{side}"].select(entries) for side in ("train", "test"))

@@ -416,6 +416,9 @@ def test_files_and_signatures_do_not_go_together(run: Any, tmp_path: Path) -> No
     place = body_files(tmp_path / "meshes", range(1), range(1))
     with pytest.raises(recipe_module("_run").UserError, match=r"--model\.descriptors none"):
         run("corenet3d", "--data", f"folder:{place}", "--steps", 1)
+    known = ("--preset", "small", "--init", "corenet3d-humans")  # without descriptors it would be another network
+    with pytest.raises(recipe_module("_run").UserError, match="as no shipped ones do"):
+        run("corenet3d", "--data", f"folder:{place}", "--steps", 1, *known)
     with pytest.raises(recipe_module("_run").UserError, match="0 meshes to train on are too few, of 1"):
         run("corenet3d", "--data", f"folder:{place}", *FAST)
 

@@ -1456,10 +1456,28 @@ def test_an_animal_in_meshkits_own_frame_is_not_in_doubt(name):
 
 
 @pytest.mark.skipif(WEIGHTS not in pretrained_names(), reason="this checkout lacks the weights")
-def test_the_page_runs(capsys):
+def test_the_page_runs(capsys, tmp_path, monkeypatch):
     page = Path(__file__).parents[1] / "docs" / "transfer.md"
     blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
     names: dict[str, object] = {}
+    monkeypatch.chdir(tmp_path)
     exec(compile("\n".join(blocks), page.name, "exec"), names)
     assert "unit cm (guessed from the surface area)" in capsys.readouterr().out
     assert 1e3 * float(pmd(names["result"].verts[None], center(names["target"]))[0]) < BOUND
+
+
+def test_a_mesh_of_which_much_is_left_out_is_in_doubt(mover):
+    """Two bodies in one file; eyes, which are far smaller, are no doubt."""
+    body = load_humans()
+    verts, faces = body.template, body.faces
+    two = torch.cat([verts, verts + torch.tensor([2.0, 0, 0])]), torch.cat([faces, faces + len(verts)])
+    eye = torch.cat([verts, 0.02 * verts]), torch.cat([faces, faces + len(verts)])
+    net = copier(data="humans", usual=WIDE)
+    report = transfer_pose(two, mover, weights=net, **UPRIGHT).report
+    assert report.warnings == (
+        "the identity mesh is in parts, and the largest, which alone is used, has 50% of the area: join those of the "
+        "body into one surface, and take clothes and props away",
+    )
+    assert report.as_dict()["identity"]["kept_area"] == pytest.approx(0.5, abs=1e-4)
+    report = transfer_pose(eye, mover, weights=net, **UPRIGHT).report
+    assert report.warnings == () and "smaller parts removed: 1" in str(report)

@@ -25,6 +25,7 @@ class CleanMesh:
         target: (V,) int64 row of ``verts`` that each original vertex became, -1 where it was dropped.
         changes: what was done and how often, in order; empty if the mesh was clean.
         original: (V, 3) vertices that came in.
+        kept_area: share of the area of all parts that the kept ones have; 1 unless parts were removed.
     """
 
     verts: Tensor
@@ -33,6 +34,7 @@ class CleanMesh:
     target: Tensor
     changes: dict[str, int]
     original: Tensor
+    kept_area: float = 1.0
 
     def carry(self, deformed: Tensor) -> Tensor:
         """Original vertices after the clean mesh was deformed. Not differentiable.
@@ -137,13 +139,15 @@ def clean_mesh(
     if len(triangles) == 0:
         raise ValueError("nothing is left: every face repeats a corner, after welding")
 
-    count = len(triangles)
+    count, kept_area = len(triangles), 1.0
     triangles = edge_manifold(points, triangles)
     note("faces at an edge of more than two removed", count - len(triangles))
     if keep_largest:
         label, count = face_components(triangles), len(triangles)
         areas = np.bincount(label, np.linalg.norm(area_vectors(points, triangles), axis=1))
         note("smaller parts removed", len(areas) - 1)
+        if len(areas) > 1 and areas.sum() > 0:
+            kept_area = float(areas.max() / areas.sum())
         triangles = triangles[label == areas.argmax()]
         note("faces of smaller parts removed", count - len(triangles))
 
@@ -162,6 +166,5 @@ def clean_mesh(
     clean_verts, clean_faces = as_tensors(points[origin[used]], row[triangles], verts, faces)
     source = torch.from_numpy(origin[used]).to(verts.device)
     clean_verts = verts.detach()[source]  # the very numbers that came in
-    return CleanMesh(
-        clean_verts, clean_faces, source, torch.from_numpy(row[target]).to(verts.device), changes, verts.detach()
-    )
+    target = torch.from_numpy(row[target]).to(verts.device)
+    return CleanMesh(clean_verts, clean_faces, source, target, changes, verts.detach(), kept_area)

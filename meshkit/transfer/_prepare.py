@@ -20,6 +20,7 @@ from meshkit.transfer.confidence import roughness
 __all__ = ["Prepared", "prepare"]
 
 _GIVEN = "given"
+_ONE_BODY = 0.75  # share of the area that one surface of a whole body has: eyes and teeth are far less than the rest
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,17 @@ class Prepared:
     def found(self) -> str:
         """How ``rotation`` came about, and whether that is in doubt."""
         return self.how if self.clear or self.how == _GIVEN else f"{self.how}, in doubt"
+
+    @property
+    def loss(self) -> str:
+        """What is to be said of a mesh of which much was left out as another part; empty if that is not so."""
+        share = self.clean.kept_area
+        if share >= _ONE_BODY:
+            return ""
+        return (
+            f"in parts, and the largest, which alone is used, has {share:.0%} of the area: join those of the body into "
+            "one surface, and take clothes and props away"
+        )
 
     @property
     def doubts(self) -> tuple[str, ...]:

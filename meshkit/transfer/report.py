@@ -146,6 +146,7 @@ def _facts(mesh: Prepared) -> dict[str, Any]:
         "facing": axis_name(-mesh.rotation[1]),
         "axes": mesh.found,
         "openings": mesh.openings._asdict(),
+        "kept_area": mesh.clean.kept_area,
         "done": list(mesh.notes),
     }
 

@@ -148,9 +148,8 @@ class PoseTransfer:
         kinds = {role: self._strange(role, mesh) for role, mesh in meshes.items()}
         hopeless = {role for role, mesh in meshes.items() if kinds[role] and not _between(mesh)}
         found = [Doubt(role, text) for role, text in kinds.items() if text]
-        for role, mesh in meshes.items():
-            if text := mesh.openings.doubt:  # it may be why a mesh is of no kind, and so does not follow from that
-                found.append(Doubt(role, f"the {role} mesh is {text}"))
+        for role, mesh in meshes.items():  # these may be why a mesh is of no kind, and so do not follow from that
+            found += [Doubt(role, f"the {role} mesh is {text}") for text in (mesh.loss, mesh.openings.doubt) if text]
         for role, mesh in meshes.items():
             found += [Doubt(role, text, role in hopeless) for text in mesh.doubts]
         usual = self.net.card.get("usual", {})
