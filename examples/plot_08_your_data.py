@@ -206,14 +206,14 @@ assert off < 1e-5
 # %%
 # Train on it
 # -----------
-# The recipes read all of these. Meshes from files come without signatures, hence ``--model.descriptors none``; where
-# vertex counts differ, X-DualNet must compare all vertices, ``--points None``. A damaged file stops a recipe with a
-# line that names it. A folder needs two people and two poses to train on, and two others of each to test on. ::
+# The recipes read all of these, and compute the signatures of files once. Where vertex counts differ, X-DualNet must
+# compare all vertices, ``--points None``. A damaged file stops a recipe with a line that names it. A folder needs two
+# people and two poses to train on, and two others of each to test on. ::
 #
 #     python recipes/xdualnet.py --data smpl:body.npz
 #     python recipes/xdualnet.py --data smal:smal_CVPR2017.pkl
-#     python recipes/xdualnet.py --data folder:meshes --model.descriptors none --points None
-#     python recipes/corenet3d.py --data folder:meshes --model.descriptors none
+#     python recipes/xdualnet.py --data folder:meshes --points None
+#     python recipes/corenet3d.py --data folder:meshes
 #     python recipes/npt.py --data folder:meshes
 #
 # ``meshkit-transfer identity.obj pose.obj -o posed.obj`` cleans its meshes by itself, and needs no training.

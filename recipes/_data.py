@@ -38,10 +38,13 @@ from meshkit.data import (
 )
 from meshkit.io import MeshFileError
 from meshkit.models import NPT
+from meshkit.models.pretrained import extents
 
 KINDS = "humans, animals, smpl:<file>, smal:<file>, faust:<folder>, mgn:<folder> or folder:<folder>"
 SCANNERS = {"faust": scan_faust, "mgn": scan_mgn, "folder": scan_pose_transfer}
 Pairs = PosePairs | MeshPairs
+SMALLEST, LARGEST = 0.5, 4.0
+"""Longest sides of the shipped bodies: people in metres, animals in their unit."""
 IN_METRES = ("humans", "smpl", "faust", "mgn")
 """Kinds of --data whose bodies are in metres; the animals' unit is arbitrary, that of other folders unknown."""
 
@@ -64,7 +67,7 @@ def data(cfg: Any, run: Run, workers: int, device: torch.device | str = "cpu") -
             if cfg.sampled_identities or cfg.sampled_poses:
                 flag = "identities" if cfg.sampled_identities else "poses"
                 raise UserError(f"--sampled-{flag} needs a rig, whose {flag} have coefficients: drop it")
-            return files(cfg, run, SCANNERS[kind](place))
+            return files(cfg, run, workers, SCANNERS[kind](place))
         body, split = rigged(kind, Path(place)) if place else load_shipped(kind, cfg.vertices)
         if cfg.sampled_identities:
             body, split = with_sampled_identities(body, split, cfg.sampled_identities, cfg.seed, cfg.bone_spread)
@@ -172,15 +175,8 @@ def drawn_split(identities: int, poses: int, draw: torch.Generator) -> Split:
     return Split(who[a:].sort()[0], who[:a].sort()[0], how[b:].sort()[0], how[:b].sort()[0], torch.stack(rows, 1))
 
 
-def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, MeshPairs]:
+def files(cfg: Any, run: Run, workers: int, entries: list[MeshEntry]) -> tuple[MeshPairs, MeshPairs]:
     """Pairs of meshes from files: the released split where their numbers are those of a released data set."""
-    if cfg.model.descriptors != "none":
-        if cfg.init is not None:  # without the descriptors its network would be another one
-            raise UserError(
-                f"meshes from files come without signatures: --init {cfg.init} goes with them only if those weights "
-                "take none (--model.descriptors none), as no shipped ones do; docs/recipes.md has a loop for these"
-            )
-        raise UserError("meshes from files come without signatures: add --model.descriptors none")
     for name in ("humans", "animals"):
         train, test = (RELEASED_SPLITS[f"{name}-{side}"].select(entries) for side in ("train", "test"))
         if len(train) > 1 and len(test) > 1:
@@ -208,9 +204,18 @@ def files(cfg: Any, run: Run, entries: list[MeshEntry]) -> tuple[MeshPairs, Mesh
             raise UserError(f"--data {cfg.data}: {error}{advice}") from None
         if len(stores[-1]) < 2:
             raise UserError(f"--data {cfg.data}: {len(stores[-1])} readable meshes to {side} on are too few")
+        if cfg.model.descriptors == "wks" and not (cfg.steps == 0 and side == "train"):
+            try:
+                stores[-1].describe(num_signatures=cfg.model.num_signatures, workers=workers, progress=run.writes)
+            except MeshFileError as error:
+                raise UserError(
+                    f"--data {cfg.data}: {error}; mend the mesh (meshkit.io.clean_mesh), remove it, or train without "
+                    "signatures (--model.descriptors none)"
+                ) from None
     common: dict[str, Any] = {"seed": cfg.seed}
     if run.writes:
         tell(stores, cfg.eval_pairs)
+        tell_size(stores[0])
         tell_left_out(entries, train, test)
     train_pairs = MeshPairs(stores[0], length=cfg.pairs, resample=cfg.resample, ground_truth=cfg.ground_truth, **common)
     return train_pairs, MeshPairs(stores[1], length=cfg.eval_pairs, ground_truth=known(stores[1]), **common)
@@ -242,6 +247,18 @@ def tell(stores: list[MeshStore], eval_pairs: int) -> None:
         )
 
 
+def tell_size(store: MeshStore) -> None:
+    """Warn of meshes whose unit cannot be the one that the settings, and shipped weights, are for."""
+    some = range(0, len(store), -(-len(store) // 32))
+    side = float(torch.stack([extents(store.view("verts", k)).max() for k in some]).median())
+    if not SMALLEST < side < LARGEST:
+        print(
+            f"warning: the meshes are {side:.3g} long; the settings are for bodies of {SMALLEST:g} to {LARGEST:g} "
+            "(metres): scale the files",
+            file=sys.stderr,
+        )
+
+
 def tell_left_out(entries: list[MeshEntry], train: list[MeshEntry], test: list[MeshEntry]) -> None:
     """Say which meshes are on neither side of the split, and why."""
     (people, poses), (unseen_people, unseen_poses) = (
@@ -265,6 +282,16 @@ def tell_left_out(entries: list[MeshEntry], train: list[MeshEntry], test: list[M
     for why, names in groups.items():
         shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
         print(f"  {len(names)} of {why}: {shown}", flush=True)
+
+
+def some_descriptors(pairs: Pairs, most: int = 256) -> Tensor | None:
+    """Descriptors of training meshes, those of at most ``most`` files; ``None`` if there are none."""
+    if isinstance(pairs, PosePairs):
+        return None if pairs.pool is None else pairs.pool.descriptors
+    if not pairs.descriptor_width:
+        return None
+    store = pairs.store
+    return torch.cat([store.view("descriptors", k) for k in range(0, len(store), -(-len(store) // most))])
 
 
 def known(store: MeshStore) -> bool:

@@ -15,7 +15,7 @@ from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
-from _data import data, unit_of
+from _data import data, some_descriptors, unit_of
 from _fabric import connect
 from _machine import keep_freed_memory
 from _report import evaluate, report
@@ -75,9 +75,9 @@ def follow(cfg: Settings, build: Build, step: Step, run: Run) -> None:
             train_pairs, test_pairs = data(needed, run, torch.get_num_threads(), fabric.device)
     except (ValueError, RuntimeError) as error:
         raise UserError(str(error)) from None
-    pool = getattr(train_pairs, "pool", None)
-    if pool is not None and cfg.init is None:
-        cast(Any, generator).fit_descriptors(pool.descriptors)
+    descriptors = some_descriptors(train_pairs)
+    if descriptors is not None and cfg.init is None:
+        cast(Any, generator).fit_descriptors(descriptors)
     fused = fabric.device.type in ("cuda", "cpu")
     optimizer = torch.optim.Adam(generator.parameters(), lr=cfg.lr, betas=cfg.betas, eps=cfg.adam_eps, fused=fused)
     if cfg.compile:

@@ -26,6 +26,7 @@ from meshkit.data import (
     scan_mgn,
     scan_pose_transfer,
 )
+from meshkit.descriptors import intrinsic_descriptors
 from meshkit.io import MeshFileError, load_mesh, save_mesh
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
@@ -201,6 +202,105 @@ BAD = {
     "0_17.stl": "",
     "0_18.glb": "glTF truncated",
 }
+
+
+# Descriptors
+
+FEW = {"num_signatures": 4, "num_eigenpairs": 12, "progress": False}
+
+
+def described(grid: Path, cache: Path, **options) -> MeshStore:
+    store = MeshStore.build(scan_pose_transfer(grid), cache, progress=False, shard_bytes=60_000)
+    assert store.descriptor_width == 0
+    store.describe(**FEW | options)
+    return store
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_descriptors_are_those_of_each_mesh(grid, tmp_path, workers):
+    store = described(grid, tmp_path, workers=workers)
+    assert store.descriptor_width == 5
+    for k in range(len(store)):
+        alone = intrinsic_descriptors(
+            store.verts(k), store.faces(k), num_signatures=4, num_eigenpairs=12, method="fast"
+        )
+        assert torch.allclose(store.view("descriptors", k), alone, atol=1e-5), store.entries[k].path
+
+
+def test_descriptors_are_computed_once_and_go_on_where_they_stopped(grid, tmp_path, monkeypatch):
+    store = described(grid, tmp_path)
+    before = [store.view("descriptors", k).clone() for k in range(len(store))]
+    files = sorted(tmp_path.glob("descriptors-*.npy"))
+    assert len(files) == len(store.shard.unique()) > 2
+    asked: list[int] = []
+    module = "meshkit.data.store.signatures"
+    count = MeshStore.describe.__globals__["signatures"]
+    monkeypatch.setattr(module, lambda verts, *rest, **options: count(seen(verts, asked), *rest, **options))
+
+    def again(**options) -> list[Tensor]:
+        asked.clear()
+        opened = described(grid, tmp_path, **options)
+        return [opened.view("descriptors", k) for k in range(len(opened))]
+
+    assert all(map(torch.equal, again(), before)) and asked == []
+    files[1].unlink()  # as if it had been stopped there
+    files[2].write_bytes(files[2].read_bytes()[:200])
+    lost = int(torch.isin(store.shard, torch.tensor([1, 2])).sum())
+    assert all(map(torch.equal, again(), before)) and len(asked) == lost > 0
+    assert again(num_signatures=3)[0].shape == (1000, 4) and len(asked) == len(store)
+    assert again(num_signatures=3, num_eigenpairs=8)[0].shape == (1000, 4) and len(asked) == len(store)
+
+
+def seen(meshes, counts: list[int]):
+    for verts in meshes:
+        counts.append(len(verts))
+        yield verts
+
+
+def test_other_files_have_descriptors_of_their_own(bodies, tmp_path):
+    for how in (0, 1):
+        save_mesh(tmp_path / f"0_{how}.ply", mesh(bodies, 0, how), bodies[0].faces)
+    first = described(tmp_path, tmp_path / "cache").view("descriptors", 0).clone()
+    save_mesh(tmp_path / "0_0.ply", 1.5 * mesh(bodies, 0, 0), bodies[0].faces)
+    second = described(tmp_path, tmp_path / "cache").view("descriptors", 0)
+    assert torch.allclose(second[:, -1] - first[:, -1], torch.tensor(1.5).log())  # the logarithm of the size
+
+
+def test_a_mesh_without_descriptors_is_named(bodies, tmp_path):
+    save_mesh(tmp_path / "0_0.ply", mesh(bodies, 0, 0), bodies[0].faces)
+    save_mesh(tmp_path / "0_1.ply", mesh(bodies, 0, 1), bodies[0].faces[:-700])  # vertices of no face
+    with pytest.raises(MeshFileError, match=r"0_1\.ply: no descriptors: "):
+        described(tmp_path, tmp_path / "cache")
+    store = MeshStore(tmp_path / "cache")
+    with pytest.raises(ValueError, match="num_signatures must be a whole number, at least 1, got 0"):
+        store.describe(num_signatures=0)
+
+
+def test_pairs_hand_out_descriptors_in_the_order_of_the_vertices(grid, tmp_path):
+    store = described(grid, tmp_path)
+    pairs = MeshPairs(store, length=20)
+    batch = pairs[[(0, i) for i in range(20)]]
+    assert batch.identity_mask is not None and batch.identity_descriptors.shape == (*batch.identity.shape[:2], 5)
+    for role in ("identity", "pose"):
+        verts, known, mask = (getattr(batch, name) for name in (role, f"{role}_descriptors", f"{role}_mask"))
+        assert bool((known[~mask] == 0).all())
+        for b in range(20):
+            rows = verts[b, mask[b]]
+            k = next(k for k in range(len(store)) if is_mesh(store, k, rows))
+            place = distances(store.verts(k) - store.center[k], rows).argmin(0)
+            assert torch.equal(known[b, mask[b]], store.view("descriptors", k)[place])
+    with pytest.raises(ValueError, match="descriptors are of clean meshes: pose_noise must be 0"):
+        MeshPairs(store, pose_noise=0.1)
+
+
+def is_mesh(store: MeshStore, k: int, rows: Tensor) -> bool:
+    """Whether the rows are the centred vertices of mesh k in another order."""
+    own = store.verts(k) - store.center[k]
+    return own.shape == rows.shape and bool((distances(own, rows).min(0)[0] < 1e-5).all())
+
+
+def distances(a: Tensor, b: Tensor) -> Tensor:
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")  # exact
 
 
 def test_bad_files_are_named_and_skipped_on_request(tmp_path):

@@ -1,6 +1,7 @@
 """The other recipes: what they minimise, and that each runs from data to report."""
 
 import errno
+import itertools
 import json
 import math
 import os
@@ -20,6 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from meshkit.data import (
     MeshPool,
+    MeshStore,
     PairBatch,
     PosePairs,
     human_split,
@@ -29,7 +31,7 @@ from meshkit.data import (
     scale_bones,
 )
 from meshkit.io import save_mesh
-from meshkit.models import GeneratorConfig, load_generator
+from meshkit.models import GeneratorConfig, load_generator, load_pretrained
 from meshkit.norm import SPAdaIN
 
 pytest.importorskip("tyro")
@@ -40,6 +42,7 @@ TINY = (
     *("--pairs", 12, "--pool", 3, "--eval-pairs", 2, "--batch", 2),
 )
 SMALL_EXTRACTOR = ("--model.k", 4, "--model.extractor-widths", 8, 8)
+WITH_DESCRIPTORS = ("--model.num-signatures", 5, *SMALL_EXTRACTOR, "--model.widths", 8, 8)
 WITHOUT_DESCRIPTORS = ("--model.descriptors", "none", "--model.condition", "features")
 
 
@@ -412,15 +415,51 @@ def test_samples_need_a_rig(what: str, run: Any, tmp_path: Path) -> None:
         run("corenet3d", "--data", f"folder:{tmp_path / 'meshes'}", f"--sampled-{what}", 5, *WITHOUT_DESCRIPTORS)
 
 
-def test_files_and_signatures_do_not_go_together(run: Any, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_report")
+def test_meshes_from_files_have_signatures(
+    run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = body_files(tmp_path / "meshes", range(4), range(4))
+    words = ("corenet3d", "--data", f"folder:{place}", *WITH_DESCRIPTORS, "--eval-pairs", 2)
+    folder = run(*words, "--steps", 1)
+    net = load_generator(folder)[0]
+    stores = [MeshStore(folder / f"cache_{side}") for side in ("train", "test")]
+    for store in stores:
+        store.describe(num_signatures=5, progress=False)
+    flat = torch.cat([stores[0].view("descriptors", k) for k in range(len(stores[0]))])
+    assert torch.allclose(net.descriptor_mean, flat.mean(0), atol=1e-4), "standardised by the training meshes alone"
+    monkeypatch.setattr("meshkit.data.store.signatures", lambda *a, **k: pytest.fail("computed again"))
+    run(*words, "--steps", 2, "--resume")
+    assert "metres" not in capsys.readouterr().err
+
+
+def test_shipped_weights_go_on_with_meshes_from_files(run: Any, tmp_path: Path) -> None:
+    place = body_files(tmp_path / "meshes", range(4), range(4))
+    known = ("--preset", "small", "--init", "corenet3d-humans", "--batch", 1, "--steps", 1, "--eval-pairs", 1)
+    folder = run("corenet3d", "--data", f"folder:{place}", *known, "--lr", 0, "--pairs", 1)
+    shipped = load_pretrained("corenet3d-humans").generator
+    assert torch.equal(load_generator(folder)[0].descriptor_mean, shipped.descriptor_mean)
+    # Bodies that it was trained on: the error is that of the weights, not of a new network.
+    assert read_json(folder / "summary.json")["test"]["pmd"] < 3
+
+
+def test_a_folder_that_is_too_small_or_of_another_unit_is_told(
+    run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     place = body_files(tmp_path / "meshes", range(1), range(1))
-    with pytest.raises(recipe_module("_run").UserError, match=r"--model\.descriptors none"):
-        run("corenet3d", "--data", f"folder:{place}", "--steps", 1)
-    known = ("--preset", "small", "--init", "corenet3d-humans")  # without descriptors it would be another network
-    with pytest.raises(recipe_module("_run").UserError, match="as no shipped ones do"):
-        run("corenet3d", "--data", f"folder:{place}", "--steps", 1, *known)
     with pytest.raises(recipe_module("_run").UserError, match="0 meshes to train on are too few, of 1"):
         run("corenet3d", "--data", f"folder:{place}", *FAST)
+    body = load_humans(1000)
+    for who, how in itertools.product(range(4), range(4)):
+        verts = body(torch.tensor([who]), torch.tensor([how]))[0]
+        save_mesh(
+            tmp_path / "cm" / f"{who}_{how}.ply", 100 * verts, body.faces[: -700 if (who, how) == (0, 0) else None]
+        )
+    words = ("corenet3d", "--data", f"folder:{tmp_path / 'cm'}", "--steps", 1)
+    with pytest.raises(recipe_module("_run").UserError, match=r"0_0\.ply: no descriptors: .*--model\.descriptors none"):
+        run(*words, *WITH_DESCRIPTORS)
+    run(*words, *FAST, "--eval-pairs", 1)
+    assert "long; the settings are for bodies of 0.5 to 4 (metres): scale the files" in capsys.readouterr().err
 
 
 # Failures

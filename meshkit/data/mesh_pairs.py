@@ -31,7 +31,7 @@ class MeshPairs(Dataset[PairBatch]):
     meshes of the store.
 
     Args:
-        store: the meshes.
+        store: the meshes; with their descriptors, 0 in the padding, if :meth:`MeshStore.describe` was called before.
         length: pairs per epoch.
         seed: of everything random.
         resample: draw new pairs each epoch, instead of one fixed set in new vertex orders.
@@ -46,8 +46,9 @@ class MeshPairs(Dataset[PairBatch]):
             two meshes share a pose gives only pairs whose pose mesh is the ground truth, with a warning.
 
     Raises:
-        ValueError: a length or window below 1, negative noise, less than two meshes, no ground truth in the store,
-            meshes of one identity that differ in vertex count, or listed places that are not there.
+        ValueError: a length or window below 1, noise that is negative or beside descriptors, less than two meshes, no
+            ground truth in the store, meshes of one identity that differ in vertex count, or listed places that are
+            not there.
         TypeError: indexed with anything but addresses.
 
     Example:
@@ -84,10 +85,13 @@ class MeshPairs(Dataset[PairBatch]):
             raise ValueError(
                 f"need length >= 1, pose_noise >= 0 and window >= 1, got {length}, {pose_noise} and {window}"
             )
+        if pose_noise > 0 and store.descriptor_width:
+            raise ValueError(f"descriptors are of clean meshes: pose_noise must be 0 beside them, got {pose_noise}")
         if len(store) < 2 and listed is None:
             raise ValueError(f"pairs need at least 2 meshes, the store has {len(store)}")
         self.store, self.seed, self.resample, self.shuffle = store, seed, resample, shuffle
         self.ground_truth, self.pose_noise, self.window = ground_truth, pose_noise, window
+        self.descriptor_width = store.descriptor_width
         self.listed = None if listed is None else list(listed)
         self.length = length if self.listed is None else len(self.listed)
         self.num_shards = int(store.shard.max()) + 1
@@ -120,6 +124,8 @@ class MeshPairs(Dataset[PairBatch]):
         pose, pose_faces, mask_b = self._allocate(b)
         truth = torch.zeros_like(identity) if self.ground_truth else identity[:, :0]
         match = torch.full(identity.shape[:2], -1, device="cpu")
+        width = self.descriptor_width
+        known_a, known_b = (x.new_zeros(*x.shape[:2], width) if width else None for x in (identity, pose))
         registered = (store.topology[a] == store.topology[b]).tolist()
         for row, (epoch, i) in enumerate(addresses):
             k, m, t = drawn[row]
@@ -128,6 +134,9 @@ class MeshPairs(Dataset[PairBatch]):
             _take(store, k, orders[0], identity[row], identity_faces[row])
             if registered[row]:
                 torch.index_select(rank_b, 0, orders[0], out=match[row, : len(orders[0])])
+            for known, mesh, order in ((known_a, k, orders[0]), (known_b, m, orders[1])):
+                if known is not None:
+                    torch.index_select(store.view("descriptors", mesh), 0, order, out=known[row, : len(order)])
             if self.ground_truth:
                 torch.index_select(store.view("verts", t), 0, orders[0], out=truth[row, : len(orders[0])])
             if self.pose_noise > 0:
@@ -143,6 +152,8 @@ class MeshPairs(Dataset[PairBatch]):
             correspondence=match,
             identity_index=store.identity[a],
             pose_index=store.pose[b],
+            identity_descriptors=known_a,
+            pose_descriptors=known_b,
             identity_mask=mask_a,
             pose_mask=mask_b,
         )

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from itertools import repeat
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from meshkit.data._signatures import signatures
 from meshkit.data.rigged import RiggedModel
-from meshkit.descriptors import intrinsic_descriptors
 
 __all__ = ["MeshPool"]
 
@@ -111,54 +105,19 @@ class MeshPool:
 
         with torch.no_grad():
             verts = torch.cat([model(i, p) for i, p in zip(identity.split(64), pose.split(64), strict=True)])
-        compute = partial(_signature, faces=model.faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs)
-        # Spawned processes do not inherit the threads of this one, which forked ones would find half alive.
-        context = multiprocessing.get_context("spawn")
-        bar = partial(tqdm, total=len(verts), desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True)
-        if workers <= 1:
-            with _one_thread_here():
-                signatures = list(bar(map(compute, verts)))
-        else:
-            with _one_thread_each(), ProcessPoolExecutor(workers, mp_context=context) as executor:
-                signatures = list(bar(executor.map(compute, [v.numpy() for v in verts], chunksize=8)))
-        return cls(identity, pose, verts, torch.stack([torch.from_numpy(s) for s in signatures]))
+        computed = signatures(
+            verts, repeat(model.faces), num_signatures=num_signatures, num_eigenpairs=num_eigenpairs, workers=workers
+        )
+        bar = tqdm(
+            computed, total=len(verts), desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True
+        )
+        descriptors = []
+        for result in bar:
+            if isinstance(result, ValueError):
+                raise result
+            descriptors.append(torch.from_numpy(result))
+        return cls(identity, pose, verts, torch.stack(descriptors))
 
     def state_dict(self) -> dict[str, Tensor]:
         """The four tensors, to be saved."""
         return {name: getattr(self, name).contiguous() for name in self.__dataclass_fields__}
-
-
-@contextmanager
-def _one_thread_here() -> Iterator[None]:
-    """Small matrices gain nothing from threads, and lose much where other processes share the cores."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started here run their linear algebra on one thread; several each would fight for the cores."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _signature(verts: Tensor | np.ndarray, *, faces: Tensor, num_signatures: int, num_eigenpairs: int) -> np.ndarray:
-    points = verts if isinstance(verts, Tensor) else torch.from_numpy(verts)
-    result = intrinsic_descriptors(
-        points, faces, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs, method="fast"
-    )
-    # NumPy arrays cross process borders by value; tensors would go through shared memory handles.
-    return result.numpy()

@@ -16,13 +16,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from meshkit._checks import check_whole
+from meshkit.data._signatures import signatures
 from meshkit.data.layouts import MeshEntry
 from meshkit.io import MeshFileError, atomic_write, load_mesh
 
 __all__ = ["MeshStore"]
 
 _FORMAT = 3
-_DTYPES = {"verts": "float32", "faces": "int32"}
+_DTYPES = {"verts": "float32", "faces": "int32", "descriptors": "float32"}
+_DESCRIBED = "descriptors.json"
 _HEADER = 64  # bytes of an .npy file before its numbers, at least
 _OPEN_MAPS = 64
 
@@ -47,6 +50,7 @@ class MeshStore:
         topology: ``(P,)`` number of the face list: meshes with equal ones are taken to be registered to each other.
         shard: ``(P,)`` shard that holds each.
         skipped: names of files that could not be read, with the reason.
+        descriptor_width: numbers per vertex that :meth:`describe` has computed; 0 before it was called.
 
     Raises:
         MeshFileError: no store of this format in the folder, or shards missing.
@@ -70,7 +74,7 @@ class MeshStore:
             if index["format"] != _FORMAT:
                 raise ValueError(f"format {index['format']}, not {_FORMAT}")
             rows = np.array(index["rows"], dtype=np.int64).reshape(-1, 8)
-            names, _ = index["paths"], index["centers"]
+            names, _, self._key = index["paths"], index["centers"], index["key"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise MeshFileError(f"{self.cache}: no store of meshes in it ({error}); build it") from error
         self.entries = [
@@ -82,9 +86,10 @@ class MeshStore:
         self.num_verts = torch.from_numpy(self._spans[:, 1] - self._spans[:, 0])
         self.num_faces = torch.from_numpy(self._spans[:, 3] - self._spans[:, 2])
         self.center = torch.tensor(index["centers"], device="cpu").view(-1, 3)
+        self.descriptor_width = 0
         self._maps: OrderedDict[tuple[str, int], Tensor] = OrderedDict()
         for number in self.shard.unique().tolist():
-            for kind in _DTYPES:
+            for kind in ("verts", "faces"):
                 path, needed = self._file(kind, number), _HEADER + 12 * self._rows_of(kind, number)
                 if not path.is_file() or path.stat().st_size < needed:
                     state = "cut short" if path.exists() else "missing"
@@ -130,8 +135,8 @@ class MeshStore:
                 return cls(cache)
         cache.mkdir(parents=True, exist_ok=True)
         (cache / "index.json").unlink(missing_ok=True)  # without an index, what follows is no store until it is whole
-        for stale in (*cache.glob("verts-*.npy"), *cache.glob("faces-*.npy")):
-            stale.unlink()
+        for stale in (*(path for kind in _DTYPES for path in cache.glob(f"{kind}-*.npy")), cache / _DESCRIBED):
+            stale.unlink(missing_ok=True)
         stored: dict[int, tuple[list[int], list[float]]] = {}
         bad: dict[int, tuple[str, str]] = {}
         topologies: dict[bytes, int] = {}
@@ -189,9 +194,74 @@ class MeshStore:
         """Faces ``(F, 3)`` int64 of mesh k."""
         return self.view("faces", k).long()
 
+    def describe(
+        self, *, num_signatures: int = 16, num_eigenpairs: int = 64, workers: int = 1, progress: bool = True
+    ) -> None:
+        """Compute intrinsic descriptors of every mesh and store them beside it; what is there already is only opened.
+
+        :class:`~meshkit.data.MeshPairs` made afterwards provide them. They are written shard by shard: when stopped,
+        the same call goes on with the shard it was at.
+
+        Args:
+            num_signatures: see :func:`~meshkit.descriptors.intrinsic_descriptors`.
+            num_eigenpairs: likewise.
+            workers: processes; the eigensolver uses one core each. With more than one, a script must keep its work
+                under ``if __name__ == "__main__"``, as for any spawned process.
+            progress: show a progress bar.
+
+        Raises:
+            MeshFileError: a mesh that has no descriptors, with the reason.
+            ValueError: a number of signatures or eigenpairs below 1.
+        """
+        from tqdm import tqdm
+
+        check_whole(num_signatures, "num_signatures")
+        check_whole(num_eigenpairs, "num_eigenpairs")
+        described = json.dumps([_FORMAT, self._key, num_signatures, num_eigenpairs])
+        note = self.cache / _DESCRIBED
+        for key in [key for key in self._maps if key[0] == "descriptors"]:
+            del self._maps[key]
+        if not note.is_file() or note.read_text() != described:
+            for stale in self.cache.glob("descriptors-*.npy"):
+                stale.unlink()
+            with atomic_write(note) as temporary:
+                temporary.write_text(described)
+        self.descriptor_width = num_signatures + 1
+        missing = [number for number in self.shard.unique().tolist() if not self._is_described(number)]
+        total = int(torch.isin(self.shard, torch.tensor(missing, device="cpu")).sum())
+        with tqdm(total=total, desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True) as bar:
+            for number in missing:
+                members = (self.shard == number).nonzero()[:, 0].tolist()
+                members.sort(key=lambda k: int(self._spans[k, 0]))  # as their vertices are stored
+                computed = signatures(
+                    (self.verts(k) for k in members),
+                    (self.faces(k) for k in members),
+                    num_signatures=num_signatures,
+                    num_eigenpairs=num_eigenpairs,
+                    workers=workers,
+                )
+                parts = []
+                for k, result in zip(members, computed, strict=True):
+                    if isinstance(result, ValueError):
+                        raise MeshFileError(f"{self.entries[k].path}: no descriptors: {result}")
+                    parts.append(result)
+                    bar.update()
+                with atomic_write(self._file("descriptors", number)) as temporary:
+                    np.save(temporary, np.concatenate(parts))
+
+    def _is_described(self, number: int) -> bool:
+        try:
+            self._map("descriptors", number)
+        except MeshFileError:  # missing or damaged
+            return False
+        return True
+
     def view(self, kind: str, k: int) -> Tensor:
-        """``"verts"`` (float32) or ``"faces"`` (int32) of mesh k, not copied: pages of the file, until written to."""
-        begin, end = self._spans[k, :2] if kind == "verts" else self._spans[k, 2:]
+        """``"verts"`` (float32), ``"faces"`` (int32) or ``"descriptors"`` (float32, after :meth:`describe`) of mesh k.
+
+        Not copied: pages of the file, until written to.
+        """
+        begin, end = self._spans[k, 2:] if kind == "faces" else self._spans[k, :2]
         return self._map(kind, int(self.shard[k]))[begin:end]
 
     def _file(self, kind: str, number: int) -> Path:
@@ -200,16 +270,19 @@ class MeshStore:
     def _rows_of(self, kind: str, number: int) -> int:
         """How many rows a shard must have."""
         spans = self._spans[(self.shard == number).numpy()]
-        return int(spans[:, 1 if kind == "verts" else 3].max(initial=0))
+        return int(spans[:, 3 if kind == "faces" else 1].max(initial=0))
 
     def _map(self, kind: str, number: int) -> Tensor:
         """A memory map, of which a limited number are kept open. What is written to it stays private."""
         if (kind, number) not in self._maps:
             path, rows = self._file(kind, number), self._rows_of(kind, number)
+            width = self.descriptor_width if kind == "descriptors" else 3
             try:
                 array = np.load(path, mmap_mode="c")
-                if array.dtype != _DTYPES[kind] or array.shape[1:] != (3,) or len(array) < rows:
-                    raise ValueError(f"{array.dtype} {array.shape}, {rows} rows of 3 {_DTYPES[kind]} were written")
+                if array.dtype != _DTYPES[kind] or array.shape[1:] != (width,) or len(array) < rows:
+                    raise ValueError(
+                        f"{array.dtype} {array.shape}, {rows} rows of {width} {_DTYPES[kind]} were written"
+                    )
             except (OSError, ValueError, EOFError) as error:
                 raise MeshFileError(f"{path}: shard is damaged ({error}); delete {self.cache} and build") from error
             self._maps[kind, number] = torch.from_numpy(array)

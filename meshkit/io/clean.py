@@ -166,5 +166,5 @@ def clean_mesh(
     clean_verts, clean_faces = as_tensors(points[origin[used]], row[triangles], verts, faces)
     source = torch.from_numpy(origin[used]).to(verts.device)
     clean_verts = verts.detach()[source]  # the very numbers that came in
-    target = torch.from_numpy(row[target]).to(verts.device)
-    return CleanMesh(clean_verts, clean_faces, source, target, changes, verts.detach(), kept_area)
+    carried = torch.from_numpy(row[target]).to(verts.device)
+    return CleanMesh(clean_verts, clean_faces, source, carried, changes, verts.detach(), kept_area)
