@@ -165,9 +165,9 @@ def noise_sheet(path: Path) -> None:
 
 
 def draw_sheets(
-    to: Path, jobs: list[Job], noise: dict[str, list[float]], errors: Callable[[Job], list[float]], cfg: Any
+    to: Path, jobs: list[Job], noise: dict[str, list[float]] | None, errors: Callable[[Job], list[float]], cfg: Any
 ) -> list[str]:
-    """All sheets; those of systems show the first of a system's runs among ``jobs``.
+    """All sheets; those of systems show the first of a system's runs among ``jobs``. Without ``noise`` these alone.
 
     ``errors`` gives the PMD of every test pair of a run. Returns the names of what was drawn.
     """
@@ -192,7 +192,7 @@ def draw_sheets(
             worst = torch.tensor(errors(job)).topk(min(4, cfg.eval_pairs)).indices.tolist()
             columns = {"X-DualNet": job.name, f"xdualnet-{kind}, shipped": f"xdualnet-{kind}"}
             sheet(f"failures-{kind}", transfer_sheet, kind, columns, worst, cfg)
-    if "humans" in cfg.data:
+    if "humans" in cfg.data and noise is not None:
         sheet("topologies", topology_sheet)
         sheet("correspondence", correspondence_sheet, cfg)
         sheet("noise", noise_sheet)

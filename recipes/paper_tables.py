@@ -65,8 +65,8 @@ class Config:
     """Test pairs at 6890 vertices, for the humans' first seed; 0 for none."""
     train: bool = True
     """Train what is missing; --no-train makes tables of what there is."""
-    sheets: bool = True
-    """Draw the figure sheets, and measure noise, other triangulations and the time of a transfer."""
+    sheets: Literal["all", "runs", "none"] = "all"
+    """Figure sheets: all, with noise, triangulations and the time of a transfer; those of the runs alone; none."""
     out: Path = Path("runs/tables")
     """Folder of the runs and measurements."""
     to: Path | None = None
@@ -214,12 +214,10 @@ def main() -> None:
             failures += [] if failure is None else [failure]
             print(f"{job.name}: {failure or 'done'}, {len(missing) - number} to go", flush=True)
     done = [job for job in wanted if finished(job, cfg)]
-    extra: dict[str, Any] = {}
-    if cfg.sheets:
-        extra = measured_once(cfg)
+    extra = measured_once(cfg) if cfg.sheets == "all" else {}
     found, drawn = tables(cfg, done), list[str]()
-    if cfg.sheets:
-        drawn = draw_sheets(to, done, extra["noise"], lambda job: pmd_of(job, cfg), cfg)
+    if cfg.sheets != "none":
+        drawn = draw_sheets(to, done, extra.get("noise"), lambda job: pmd_of(job, cfg), cfg)
     write_tables(to, found, extra, PAPER_SECONDS, cfg, done, drawn)
     print(f"tables and sheets: {to}")
     if failures:

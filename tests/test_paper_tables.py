@@ -32,7 +32,7 @@ MODEL = GeneratorConfig(architecture="npt_maxpool", extractor_widths=(4, 4, 5))
 @pytest.fixture
 def config(tmp_path: Path) -> Any:
     return recipe_module("paper_tables").Config(
-        data=("humans",), pairs=8, seeds=2, eval_pairs=3, emd_pairs=2, large_pairs=0, sheets=False, out=tmp_path
+        data=("humans",), pairs=8, seeds=2, eval_pairs=3, emd_pairs=2, large_pairs=0, sheets="none", out=tmp_path
     )
 
 
@@ -55,7 +55,7 @@ def tables(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Pat
             "--large-pairs",
             0,
         ]
-        words = ["paper_tables.py", *words, "--no-train", "--no-sheets", "--out", tmp_path, *arguments]
+        words = ["paper_tables.py", *words, "--no-train", "--sheets", "none", "--out", tmp_path, *arguments]
         monkeypatch.setattr(sys, "argv", [str(word) for word in words])
         recipe_module("paper_tables").main()
         return tmp_path
@@ -289,6 +289,8 @@ def test_sheets_are_drawn_of_what_there_is(config: Any, monkeypatch: pytest.Monk
     drawn = sheets.draw_sheets(tmp_path, [train.Job("humans", "npt", 0)], noise, lambda job: [1.0, 2.0, 3.0], config)
     assert drawn == ["comparison-humans", "topologies", "correspondence", "noise", "noise_curve"]
     assert [file.name for file in read] == ["descriptors-humans-1000-3.safetensors"], "read once for all sheets"
+    drawn = sheets.draw_sheets(tmp_path, [train.Job("humans", "npt", 0)], None, lambda job: [1.0, 2.0, 3.0], config)
+    assert drawn == ["comparison-humans"], "sheets of the runs alone"
     with Image.open(tmp_path / "comparison-humans.png") as picture:  # two of the four rows exist
         colors = picture.convert("RGB").getcolors(maxcolors=1 << 16)
     assert colors is not None and len(colors) > 40, "an empty sheet has white alone"
