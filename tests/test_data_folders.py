@@ -276,6 +276,23 @@ def test_a_mesh_without_descriptors_is_named(bodies, tmp_path):
         store.describe(num_signatures=0)
 
 
+def test_a_store_that_could_not_be_described_is_as_before(bodies, tmp_path):
+    for how in (0, 1):
+        save_mesh(tmp_path / f"0_{how}.ply", mesh(bodies, 0, how), bodies[0].faces[: -700 if how else None])
+    store = MeshStore.build(scan_pose_transfer(tmp_path), tmp_path / "cache", progress=False)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(MeshFileError) as caught:  # kept, as an interactive session keeps its last error
+            store.describe(**FEW)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert caught.value.__traceback__ is not None and store.descriptor_width == 0
+    batch = MeshPairs(store, ground_truth=False)[(0, 0)]
+    assert batch.identity_descriptors is None and batch.identity.shape == (1, 1000, 3)
+
+
 def test_pairs_hand_out_descriptors_in_the_order_of_the_vertices(grid, tmp_path):
     store = described(grid, tmp_path)
     pairs = MeshPairs(store, length=20)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -20,10 +20,11 @@ __all__ = ["signatures"]
 
 def signatures(
     verts: Iterable[Tensor], faces: Iterable[Tensor], *, num_signatures: int, num_eigenpairs: int, workers: int
-) -> Iterator[np.ndarray | ValueError]:
+) -> Generator[np.ndarray | ValueError, None, None]:
     """Intrinsic descriptors ``(V, num_signatures + 1)`` of each mesh in turn, by the fast method.
 
-    A mesh that has none yields the reason: the caller knows which mesh it was, a process's batch does not.
+    A mesh that has none yields the reason: the caller knows which mesh it was, a process's batch does not. To be closed
+    when left early: until then processes work on, and the number of threads is not the caller's.
     """
     compute = partial(_signature, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs)
     if workers <= 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import repeat
 
@@ -108,14 +109,17 @@ class MeshPool:
         computed = signatures(
             verts, repeat(model.faces), num_signatures=num_signatures, num_eigenpairs=num_eigenpairs, workers=workers
         )
-        bar = tqdm(
-            computed, total=len(verts), desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True
-        )
         descriptors = []
-        for result in bar:
-            if isinstance(result, ValueError):
-                raise result
-            descriptors.append(torch.from_numpy(result))
+        # An error ends the processes and gives the threads back at once.
+        with (
+            closing(computed),
+            tqdm(total=len(verts), desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True) as bar,
+        ):
+            for result in computed:
+                if isinstance(result, ValueError):
+                    raise result
+                descriptors.append(torch.from_numpy(result))
+                bar.update()
         return cls(identity, pose, verts, torch.stack(descriptors))
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ import os
 import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -219,15 +219,16 @@ class MeshStore:
         check_whole(num_eigenpairs, "num_eigenpairs")
         described = json.dumps([_FORMAT, self._key, num_signatures, num_eigenpairs])
         note = self.cache / _DESCRIBED
+        self.descriptor_width = 0  # until all are there: what failed or was stopped has none to give
         for key in [key for key in self._maps if key[0] == "descriptors"]:
             del self._maps[key]
-        if not note.is_file() or note.read_text() != described:
+        if not note.is_file() or note.read_bytes() != described.encode():
             for stale in self.cache.glob("descriptors-*.npy"):
                 stale.unlink()
             with atomic_write(note) as temporary:
                 temporary.write_text(described)
-        self.descriptor_width = num_signatures + 1
-        missing = [number for number in self.shard.unique().tolist() if not self._is_described(number)]
+        width = num_signatures + 1
+        missing = [number for number in self.shard.unique().tolist() if not self._is_described(number, width)]
         total = int(torch.isin(self.shard, torch.tensor(missing, device="cpu")).sum())
         with tqdm(total=total, desc="descriptors", unit="mesh", disable=not progress, dynamic_ncols=True) as bar:
             for number in missing:
@@ -241,17 +242,19 @@ class MeshStore:
                     workers=workers,
                 )
                 parts = []
-                for k, result in zip(members, computed, strict=True):
-                    if isinstance(result, ValueError):
-                        raise MeshFileError(f"{self.entries[k].path}: no descriptors: {result}")
-                    parts.append(result)
-                    bar.update()
+                with closing(computed):  # an error ends the processes and gives the threads back at once
+                    for k, result in zip(members, computed, strict=True):
+                        if isinstance(result, ValueError):
+                            raise MeshFileError(f"{self.entries[k].path}: no descriptors: {result}")
+                        parts.append(result)
+                        bar.update()
                 with atomic_write(self._file("descriptors", number)) as temporary:
                     np.save(temporary, np.concatenate(parts))
+        self.descriptor_width = width
 
-    def _is_described(self, number: int) -> bool:
+    def _is_described(self, number: int, width: int) -> bool:
         try:
-            self._map("descriptors", number)
+            self._load("descriptors", number, width)
         except MeshFileError:  # missing or damaged
             return False
         return True
@@ -272,20 +275,22 @@ class MeshStore:
         spans = self._spans[(self.shard == number).numpy()]
         return int(spans[:, 3 if kind == "faces" else 1].max(initial=0))
 
+    def _load(self, kind: str, number: int, width: int) -> Tensor:
+        """A memory map of a shard. What is written to it stays private."""
+        path, rows = self._file(kind, number), self._rows_of(kind, number)
+        try:
+            array = np.load(path, mmap_mode="c")
+            if array.dtype != _DTYPES[kind] or array.shape[1:] != (width,) or len(array) < rows:
+                raise ValueError(f"{array.dtype} {array.shape}, {rows} rows of {width} {_DTYPES[kind]} were written")
+        except (OSError, ValueError, EOFError) as error:
+            raise MeshFileError(f"{path}: shard is damaged ({error}); delete {self.cache} and build") from error
+        return torch.from_numpy(array)
+
     def _map(self, kind: str, number: int) -> Tensor:
-        """A memory map, of which a limited number are kept open. What is written to it stays private."""
+        """A shard, of which a limited number are kept open."""
         if (kind, number) not in self._maps:
-            path, rows = self._file(kind, number), self._rows_of(kind, number)
             width = self.descriptor_width if kind == "descriptors" else 3
-            try:
-                array = np.load(path, mmap_mode="c")
-                if array.dtype != _DTYPES[kind] or array.shape[1:] != (width,) or len(array) < rows:
-                    raise ValueError(
-                        f"{array.dtype} {array.shape}, {rows} rows of {width} {_DTYPES[kind]} were written"
-                    )
-            except (OSError, ValueError, EOFError) as error:
-                raise MeshFileError(f"{path}: shard is damaged ({error}); delete {self.cache} and build") from error
-            self._maps[kind, number] = torch.from_numpy(array)
+            self._maps[kind, number] = self._load(kind, number, width)
             if len(self._maps) > _OPEN_MAPS:
                 self._maps.popitem(last=False)
         self._maps.move_to_end((kind, number))
