@@ -208,9 +208,10 @@ def files(cfg: Any, run: Run, workers: int, entries: list[MeshEntry]) -> tuple[M
             try:
                 stores[-1].describe(num_signatures=cfg.model.num_signatures, workers=workers, progress=run.writes)
             except MeshFileError as error:
+                # Weights to begin with are of a network that takes signatures.
+                without = "" if cfg.init else ", or train without signatures (--model.descriptors none)"
                 raise UserError(
-                    f"--data {cfg.data}: {error}; mend the mesh (meshkit.io.clean_mesh), remove it, or train without "
-                    "signatures (--model.descriptors none)"
+                    f"--data {cfg.data}: {error}; mend the mesh (meshkit.io.clean_mesh) or remove it{without}"
                 ) from None
     common: dict[str, Any] = {"seed": cfg.seed}
     if run.writes:

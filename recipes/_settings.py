@@ -66,7 +66,7 @@ class Settings:
     sampled_poses: int = 0
     """Further training poses: the trunk of one of the known ones, each limb of another; rigs alone. Paper: none."""
     pool: int = 1200
-    """Training meshes whose signatures are computed beforehand (with --model.descriptors wks)."""
+    """Training meshes made of a rig, whose signatures are computed beforehand (with --model.descriptors wks)."""
     workers: int = 0
     """Processes that draw pairs; the pairs are the same for any number."""
 

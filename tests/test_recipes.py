@@ -458,6 +458,8 @@ def test_a_folder_that_is_too_small_or_of_another_unit_is_told(
     words = ("corenet3d", "--data", f"folder:{tmp_path / 'cm'}", "--steps", 1)
     with pytest.raises(recipe_module("_run").UserError, match=r"0_0\.ply: no descriptors: .*--model\.descriptors none"):
         run(*words, *WITH_DESCRIPTORS)
+    with pytest.raises(recipe_module("_run").UserError, match=r"0_0\.ply: no descriptors: .* or remove it$"):
+        run(*words, "--preset", "small", "--init", "corenet3d-humans")  # which know no network without
     run(*words, *FAST, "--eval-pairs", 1)
     assert "long; the settings are for bodies of 0.5 to 4 (metres): scale the files" in capsys.readouterr().err
 
