@@ -247,6 +247,8 @@ def test_descriptors_are_computed_once_and_go_on_where_they_stopped(grid, tmp_pa
     files[2].write_bytes(files[2].read_bytes()[:200])
     lost = int(torch.isin(store.shard, torch.tensor([1, 2])).sum())
     assert all(map(torch.equal, again(), before)) and len(asked) == lost > 0
+    (tmp_path / "descriptors.json").write_bytes(b"\xff")  # no text
+    assert all(map(torch.equal, again(), before)) and len(asked) == len(store)
     assert again(num_signatures=3)[0].shape == (1000, 4) and len(asked) == len(store)
     assert again(num_signatures=3, num_eigenpairs=8)[0].shape == (1000, 4) and len(asked) == len(store)
 
