@@ -274,6 +274,8 @@ def test_a_mesh_without_descriptors_is_named(bodies, tmp_path):
     with pytest.raises(MeshFileError, match=r"0_1\.ply: no descriptors: "):
         described(tmp_path, tmp_path / "cache")
     store = MeshStore(tmp_path / "cache")
+    with pytest.raises(ValueError, match=r"no descriptors yet: call describe\(\) first"):
+        store.view("descriptors", 0)
     with pytest.raises(ValueError, match="num_signatures must be a whole number, at least 1, got 0"):
         store.describe(num_signatures=0)
 

@@ -46,8 +46,8 @@ def _signature(
         result = intrinsic_descriptors(
             points, triangles, num_signatures=num_signatures, num_eigenpairs=num_eigenpairs, method="fast"
         )
-    except ValueError as error:
-        return error
+    except (ValueError, RuntimeError) as error:  # the latter from an eigensolver that does not converge
+        return ValueError(str(error))
     # NumPy arrays cross process borders by value; tensors would go through shared memory handles.
     return result.numpy()
 

@@ -264,6 +264,8 @@ class MeshStore:
 
         Not copied: pages of the file, until written to.
         """
+        if kind == "descriptors" and not self.descriptor_width:
+            raise ValueError(f"{self.cache}: no descriptors yet: call describe() first")
         begin, end = self._spans[k, 2:] if kind == "faces" else self._spans[k, :2]
         return self._map(kind, int(self.shard[k]))[begin:end]
 
