@@ -237,7 +237,7 @@ def test_pool_is_reproducible_with_any_number_of_workers(pool, humans):
 
 def test_a_pool_made_here_keeps_to_one_thread(humans, monkeypatch):
     """Two such processes on two cores would fight for them."""
-    from meshkit.data import pool as module
+    from meshkit.data import _signatures as module
 
     seen = []
 
