@@ -57,7 +57,7 @@ class MeshStore:
 
     Example:
         >>> import tempfile
-        >>> from meshkit.data import load_humans, scan_pose_transfer
+        >>> from meshkit.data import MeshPairs, load_humans, scan_pose_transfer
         >>> from meshkit.io import save_mesh
         >>> folder, body = Path(tempfile.mkdtemp()), load_humans()
         >>> for who, how in ((0, 0), (0, 1), (1, 0), (1, 1)):
@@ -65,6 +65,9 @@ class MeshStore:
         >>> store = MeshStore.build(scan_pose_transfer(folder), folder / "cache", progress=False)
         >>> len(store), store.verts(3).shape, store.topology.tolist()
         (4, torch.Size([1000, 3]), [0, 0, 0, 0])
+        >>> store.describe(num_signatures=4, progress=False)
+        >>> MeshPairs(store)[0, 0].identity_descriptors.shape
+        torch.Size([1, 1000, 5])
     """
 
     def __init__(self, cache: str | os.PathLike[str]) -> None:
@@ -200,7 +203,7 @@ class MeshStore:
         """Compute intrinsic descriptors of every mesh and store them beside it; what is there already is only opened.
 
         :class:`~meshkit.data.MeshPairs` made afterwards provide them. They are written shard by shard: when stopped,
-        the same call goes on with the shard it was at.
+        the same call goes on with the shard it was at. In memory at a time: those of one shard, twice.
 
         Args:
             num_signatures: see :func:`~meshkit.descriptors.intrinsic_descriptors`.
