@@ -38,13 +38,11 @@ from meshkit.data import (
 )
 from meshkit.io import MeshFileError
 from meshkit.models import NPT
-from meshkit.models.pretrained import extents
+from meshkit.models.pretrained import extents, usual_extents
 
 KINDS = "humans, animals, smpl:<file>, smal:<file>, faust:<folder>, mgn:<folder> or folder:<folder>"
 SCANNERS = {"faust": scan_faust, "mgn": scan_mgn, "folder": scan_pose_transfer}
 Pairs = PosePairs | MeshPairs
-SMALLEST, LARGEST = 0.5, 4.0
-"""Longest sides of the shipped bodies: people in metres, animals in their unit."""
 IN_METRES = ("humans", "smpl", "faust", "mgn")
 """Kinds of --data whose bodies are in metres; the animals' unit is arbitrary, that of other folders unknown."""
 
@@ -252,10 +250,11 @@ def tell_size(store: MeshStore) -> None:
     """Warn of meshes whose unit cannot be the one that the settings, and shipped weights, are for."""
     some = range(0, len(store), -(-len(store) // 32))
     side = float(torch.stack([extents(store.view("verts", k)).max() for k in some]).median())
-    if not SMALLEST < side < LARGEST:
+    low, high = usual_extents("animals")  # people are within these too
+    if not low < side < high:
         print(
-            f"warning: the meshes are {side:.3g} long; the settings are for bodies of {SMALLEST:g} to {LARGEST:g} "
-            "(metres): scale the files",
+            f"warning: the meshes are {side:.3g} long; the settings are for bodies of {low:g} to {high:g} (metres): "
+            "scale the files",
             file=sys.stderr,
         )
 

@@ -190,9 +190,14 @@ def check_extent(verts: Tensor, name: str, *, advice: str, mask: Tensor | None =
             )
 
 
+def usual_extents(data: str) -> tuple[float, float]:
+    """Between what the longest sides of bodies of this kind of data lie."""
+    return _USUAL["animals" if data.partition(":")[0] in _ANIMALS else "people"]
+
+
 def unusual_extent(verts: Tensor, data: str, mask: Tensor | None = None) -> float | None:
     """The longest side of the first of meshes (..., V, 3) that no body of this kind of data has; None if all may be."""
-    low, high = _USUAL["animals" if data.partition(":")[0] in _ANIMALS else "people"]
+    low, high = usual_extents(data)
     sides = extents(verts, mask).amax(-1).flatten().tolist()
     return next((side for side in sides if not low <= side <= high), None)
 
